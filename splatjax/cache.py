@@ -31,6 +31,7 @@ from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jax.tree_util import PyTreeDef
 
+from splatjax._library import profiles_folder
 from splatjax._precision import full_precision
 
 Function = TypeVar("Function", bound=Callable)
@@ -225,7 +226,9 @@ def _processor() -> str:
 
 @functools.cache
 def _source() -> bytes:
-    return _digest(*(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py"))))
+    """Return a digest of the modules of splatjax, and of the data that they read."""
+    files = *Path(__file__).parent.rglob("*.py"), *profiles_folder().glob("*.npz")
+    return _digest(*(path.read_bytes() for path in sorted(files)))
 
 
 def _digest(*contents: bytes) -> bytes:

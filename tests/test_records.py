@@ -223,7 +223,6 @@ def test_traced_values_and_placeholders_pass_through_transformations():
             lambda: sj.exports.separable_kernel(material().gaussians, 24),
             "samples must be odd and at least 3.*got 24",
         ),
-        (lambda: sj.geometry.bust_mesh(spacing=9.0), "spacing is 9"),
         (lambda: bust_with_textures(0), "texels is 0"),
         (
             lambda: sj.geometry.complete_splats(np.concatenate([np.eye(3)] * 4)),

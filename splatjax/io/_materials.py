@@ -10,6 +10,7 @@ import numpy as np
 import tomli_w
 from jaxtyping import Array
 
+from splatjax._library import profiles_folder as profiles_folder
 from splatjax._records import check_values
 from splatjax.exports import plain_numbers
 from splatjax.fitting import DipoleStarts
@@ -54,15 +55,6 @@ _MODELS: dict[type, str] = {
     PhotonBeam: "photon beam with single scattering",
     LayeredMultipole: "multipole",
 }
-
-
-def profiles_folder() -> Path:
-    """Return the folder of the materials that come with the package: inside the wheel, or at the
-    top of a checkout.
-    """
-    package = Path(__file__).resolve().parents[1]
-    in_wheel = package / "_profiles"
-    return in_wheel if in_wheel.is_dir() else package.parent / "profiles"
 
 
 def list_materials() -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from splatjax.geometry._scatter import scatter
 
 @pytest.fixture(scope="module")
 def on_the_bust():
-    mesh = bust_mesh(spacing=1.6)
+    mesh = bust_mesh()
     points = scatter(mesh, 12_000)
     return mesh, points.positions(mesh), points.normals(mesh)
 
