@@ -6,8 +6,9 @@ from ._bins import (
     bin_items as bin_items,
     BinCapacity as BinCapacity,
     Bins as Bins,
-    scatter_slots as scatter_slots,
-    slot_plane as slot_plane,
+    TILE_SIDE as TILE_SIDE,
+    TileGrid as TileGrid,
+    TileRanges as TileRanges,
 )
 from ._dense import DenseRasterizer as DenseRasterizer
 from ._views import (
@@ -15,7 +16,6 @@ from ._views import (
     Footprints as Footprints,
     SplattingSettings as SplattingSettings,
 )
-from ._grid import TILE_SIDE as TILE_SIDE, TileGrid as TileGrid, TileRanges as TileRanges
 from ._projections import OrthographicView as OrthographicView, PerspectiveView as PerspectiveView
 from ._rasterizer import (
     AbstractRasterizer as AbstractRasterizer,
@@ -49,5 +49,6 @@ from ._surfaces import (
     visible_surfaces as visible_surfaces,
     VisibleSurfaces as VisibleSurfaces,
 )
-from ._sweeps import PartSweep as PartSweep, sum_parts as sum_parts
+from ._fragments import Sweep as Sweep
+from ._sweeps import sum_parts as sum_parts
 from ._tiles import TilePlan as TilePlan, TileRasterizer as TileRasterizer

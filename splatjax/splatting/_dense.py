@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._grid import TileGrid
+from ._bins import TileGrid
 from ._rasterizer import (
     AbstractRasterizer,
     AbstractRasterPlan,

@@ -13,7 +13,7 @@ from splatjax._combination import AbstractCombination, extreme
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats, rotation_towards
 
-from ._grid import TILE_SIDE, TileGrid
+from ._bins import TILE_SIDE, TileGrid
 from ._groups import MERGED_COUNTS
 from ._projections import OrthographicView, PerspectiveView
 from ._rasterizer import AbstractRasterPlan, FragmentSums, coverage, invalid_factor

@@ -16,11 +16,10 @@ from splatjax._precision import full_precision
 from splatjax.cache import reuse_capacity
 from splatjax.scene import Splats
 
-from ._bins import BinCapacity, bin_items
-from ._fragments import PLANES, Slots, Sweep
-from ._grid import TileGrid
+from ._bins import BinCapacity, TileGrid, bin_items
+from ._fragments import PLANES, Sweep
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, SurfaceCapacity
-from ._sweeps import PartSweep, sum_tile_fragments
+from ._sweeps import sum_tile_fragments
 from ._views import AbstractView, SplattingSettings
 
 _STEP = 1024  # of the planned number of splats
@@ -145,8 +144,8 @@ class TilePlan(AbstractRasterPlan):
         settings: SplattingSettings,
         combination: AbstractCombination,
     ) -> FragmentSums:
-        sweep, *binned = self._bin(splats, attributes, view, settings)
-        return sum_tile_fragments(sweep, self.places, combination, *binned)
+        binned = self._bin(splats, attributes, view, settings)
+        return sum_tile_fragments(self.places, combination, *binned)
 
     @full_precision
     @eqx.filter_jit
@@ -156,23 +155,20 @@ class TilePlan(AbstractRasterPlan):
         attributes: Float[Array, "attributes splats"],
         view: AbstractView,
         settings: SplattingSettings,
-    ) -> PartSweep:
-        """Prepare the stages of the sweep for those of one of several parts of the splats that the
-        view may see.
-        """
+    ) -> Sweep:
+        """Prepare the sweep over the splats of one of several parts that the view may see."""
         chosen, _ = self.choose(splats, view)
         seen = splats.take(chosen), take_points(attributes, chosen)
-        sweep, bins, *binned = self._bin(*seen, view, settings)
-        return PartSweep(sweep, bins, Slots.gathered(*binned, bins))
+        return Sweep.of(*self._bin(*seen, view, settings))
 
     def _bin(self, splats: Splats, attributes, view: AbstractView, settings: SplattingSettings):
-        """Project the splats, and list them by tile. Returns the input of a sweep: its settings,
-        the lists, and the shifts, planes and attributes of the splats.
-        """
+        """Project the splats, and list them by tile. Returns the arguments of `Sweep.of`."""
         grid = self.rasterizer.grid(view)
         footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
         return (
-            Sweep(type(view), grid, settings.full_coverage, settings.filter_radius),
+            type(view),
+            grid,
+            settings,
             bin_items(footprints.ranges(grid), grid, self.bins),
             jax.lax.stop_gradient(footprints.shift),
             tuple(getattr(footprints, name) for name in PLANES),

@@ -22,8 +22,7 @@ from worlds import FAST, PLAIN, World, named, with_leaf
 
 import splatjax as sj
 from splatjax.diffusion._neighbors import Boxes, Neighbors, find_neighbors
-from splatjax.splatting._bins import BinCapacity
-from splatjax.splatting._grid import TileGrid
+from splatjax.splatting._bins import BinCapacity, TileGrid
 from splatjax.splatting._rasterizer import SurfaceCapacity
 from splatjax.splatting._tiles import TilePlan
 
