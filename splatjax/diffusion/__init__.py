@@ -9,6 +9,7 @@ from ._clustered import (
     ClusterDiffuser as ClusterDiffuser,
     ClusterPlan as ClusterPlan,
     FINE_QUANTILE as FINE_QUANTILE,
+    StreamedDiffusion as StreamedDiffusion,
 )
 from ._dense import (
     dense_layer as dense_layer,
@@ -31,5 +32,4 @@ from ._kernel import (
     unevenness as unevenness,
 )
 from ._shape import ShapeDiffuser as ShapeDiffuser, ShapePlan as ShapePlan
-from ._streamed import StreamedDiffusion as StreamedDiffusion
 from ._clusters import POINTS_PER_BLOCK as POINTS_PER_BLOCK, compact_order as compact_order

@@ -67,17 +67,17 @@ class LayerSources(eqx.Module):
         nested = dict(zip(cells, nested_cells(centers, normals, exists, cells), strict=True))
         nested[0.0] = np.arange(len(exists), dtype=np.int32), len(exists)
         nested[np.inf] = np.full(len(exists), np.iinfo(np.int32).max // 2, np.int32), 0
-        parents, layers, count = [], [], 0
-        for layer, (own, members) in enumerate(nested[edge] for edge in edges):
-            parents.append(count + own)
-            blocks = -(-members // SOURCES_PER_BLOCK)
-            layers.append(np.full(blocks, layer, np.int32))
-            count += blocks * SOURCES_PER_BLOCK
+        own, members = zip(*(nested[edge] for edge in edges), strict=True)
+        blocks = -(-np.asarray(members) // SOURCES_PER_BLOCK)
+        layers, ends = np.repeat(np.arange(len(edges)), blocks), np.cumsum(blocks)
+        parents = np.stack(own) + SOURCES_PER_BLOCK * (ends - blocks)[:, None]
         half = -(-len(exists) // (2 * SOURCES_PER_BLOCK)) * SOURCES_PER_BLOCK
+        count = SOURCES_PER_BLOCK * len(layers)
         capacity = max(-(-count // half), -(-3 * len(edges) // 2)) * half
-        capacity = reuse_capacity(("sources", parents[0].shape, len(edges)), count, capacity)
-        layers.append(np.zeros((max(capacity, least) - count) // SOURCES_PER_BLOCK, np.int32))
-        return cls(jnp.asarray(np.stack(parents)), jnp.asarray(np.concatenate(layers)))
+        capacity = reuse_capacity(("sources", len(exists), len(edges)), count, capacity)
+        lacking = max(capacity, least) // SOURCES_PER_BLOCK - len(layers)
+        layers = np.pad(layers, (0, lacking))
+        return cls(jnp.asarray(parents, jnp.int32), jnp.asarray(layers, jnp.int32))
 
     @property
     def count(self) -> int:

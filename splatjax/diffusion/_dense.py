@@ -81,7 +81,8 @@ def dense_layer(
         squared = jnp.sum(offset * offset, axis=0)
         # Weight the sources by A_j G(v, |x - q_j|), up to a factor per point, which the means
         # cancel: the exponent of the nearest source is zero.
-        nearest = jax.lax.stop_gradient(jnp.min(squared, axis=1, keepdims=True))
+        nearest = jnp.min(squared, axis=1, keepdims=True, initial=jnp.inf)
+        nearest = jax.lax.stop_gradient(nearest)
         weight = sources.areas[None] * jnp.exp(-0.5 * (squared - nearest) / variance)
         # Sum light and mass, and their first moments about the point; divide them.
         light = jnp.concatenate([sources.irradiance, jnp.ones_like(sources.areas)[None]])
@@ -92,8 +93,5 @@ def dense_layer(
         layer = layer_values(sums, jnp.zeros_like(points.T), 1 / variance[None], flat)
         return jax.tree.map(lambda rows: jnp.moveaxis(rows, -1, 0), layer)
 
-    if sources.areas.shape[0] == 0 or points.shape[1] == 0:
-        rows, count = sources.irradiance.shape[0] + 1, points.shape[1]
-        return LayerValues(*(jnp.zeros((rows, *x, count), points.dtype) for x in ((), (3,))))
     layer = map_chunks(evaluate, points.T, at_once=_AT_ONCE)
     return jax.tree.map(lambda rows: jnp.moveaxis(rows, 0, -1), layer)

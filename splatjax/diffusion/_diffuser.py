@@ -110,8 +110,6 @@ class AbstractDiffusionPlan(eqx.Module):
 
     def material(self, material: Material) -> Material:
         """Return the material of the layers, reduced to the parameters on which they depend."""
-        if material.medium is None:
-            return material
         return dataclasses.replace(material, medium=None)
 
     @abc.abstractmethod

@@ -10,7 +10,6 @@ from ._bins import (
     TileGrid as TileGrid,
     TileRanges as TileRanges,
 )
-from ._dense import DenseRasterizer as DenseRasterizer
 from ._views import (
     AbstractView as AbstractView,
     Footprints as Footprints,
@@ -21,6 +20,7 @@ from ._rasterizer import (
     AbstractRasterizer as AbstractRasterizer,
     AbstractRasterPlan as AbstractRasterPlan,
     coverage as coverage,
+    DenseRasterizer as DenseRasterizer,
     fragment_weight as fragment_weight,
     FragmentSums as FragmentSums,
     invalid_factor as invalid_factor,

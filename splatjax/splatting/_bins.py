@@ -63,19 +63,6 @@ class TileGrid(eqx.Module):
         """
         return min(-(-self.padded_count // (2 * self.lanes)), _HALF)
 
-    def cut(self, picture: Float[Array, "rows height width"]) -> Float[Array, "tiles rows pixels"]:
-        """Divide a picture into tiles; 0 beyond its edges."""
-        rows, height, width = picture.shape
-        whole = jnp.pad(
-            picture,
-            ((0, 0), (0, self.down * TILE_SIDE - height), (0, self.across * TILE_SIDE - width)),
-        )
-        return (
-            whole.reshape(rows, self.down, TILE_SIDE, self.across, TILE_SIDE)
-            .transpose(1, 3, 0, 2, 4)
-            .reshape(self.count, rows, TILE_SIDE**2)
-        )
-
     def join(self, tiles: Float[Array, "tiles rows pixels"]) -> Float[Array, "rows height width"]:
         """Join the tiles of a picture."""
         rows = tiles.shape[1]
@@ -186,12 +173,6 @@ class BinCapacity(eqx.Module):
             with_spare(("blocks", grid), blocks, 4, per_octave=2, spare=spare),
             min(max(chunks, grid.half), whole),
         )
-
-    def coarse(self, grid: TileGrid) -> "BinCapacity":
-        """Round up to the next powers of two, and to all chunks."""
-        whole = grid.padded_count // grid.lanes
-        pairs, blocks = (1 << each.bit_length() for each in (self.pairs, self.blocks))
-        return BinCapacity(pairs, blocks, whole)
 
 
 class Bins(eqx.Module):

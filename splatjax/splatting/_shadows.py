@@ -80,8 +80,9 @@ class Bounds(eqx.Module):
         )
         center = 0.5 * (low + high)
         offset = splats.centers - center[None]
-        squared = jnp.where(exists, jnp.sum(offset * offset, axis=1), -jnp.inf)
-        squared = extreme(squared, combination)
+        squared = extreme(
+            jnp.where(exists, jnp.sum(offset * offset, axis=1), -jnp.inf), combination
+        )
         apart = squared > 0  # a single splat lies in its center, wherever it moves
         reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)
         radius = reach + extreme(splats.radii, combination)

@@ -114,10 +114,11 @@ class TilePlan(AbstractRasterPlan):
             plan = self.rasterizer.make_plan([whole], views, settings)
         # Coarse capacities, so that other bodies and pictures of the size share the program.
         grid = self.rasterizer.grid(views[0])
-        bins = plan.bins.coarse(grid)
-        front = bins.chunks * grid.lanes
-        seen = min(1 << plan.splats.bit_length(), whole.count)
-        coarse = TilePlan(self.rasterizer, seen, bins, SurfaceCapacity(front, front))
+        most = plan.splats, plan.bins.pairs, plan.bins.blocks
+        seen, pairs, blocks = (1 << count.bit_length() for count in most)
+        bins = BinCapacity(pairs, blocks, grid.padded_count // grid.lanes)
+        places = SurfaceCapacity(grid.padded_count, grid.padded_count)
+        coarse = TilePlan(self.rasterizer, min(seen, whole.count), bins, places)
         most = max(int(_tiles_behind(whole, view, settings, coarse)) for view in views)
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
@@ -129,12 +130,9 @@ class TilePlan(AbstractRasterPlan):
         self, splats: Splats, view: AbstractView
     ) -> tuple[Int[Array, " chosen"], Float[Array, ""]]:
         may_be_seen = view.may_see(splats)
-        ends = jnp.cumsum(may_be_seen.astype(jnp.int32))
-        every = jnp.arange(splats.count, dtype=jnp.int32)
-        listed = jnp.full(self.splats, splats.count, jnp.int32)
-        listed = listed.at[jnp.where(may_be_seen, ends - 1, self.splats)].set(every, mode="drop")
-        needed = needed_over_planned(ends[-1], self.splats)
-        return listed, needed.astype(splats.centers.dtype)
+        (listed,) = jnp.nonzero(may_be_seen, size=self.splats, fill_value=splats.count)
+        needed = needed_over_planned(jnp.sum(may_be_seen), self.splats)
+        return listed.astype(jnp.int32), needed.astype(splats.centers.dtype)
 
     def sum_fragments(
         self,
