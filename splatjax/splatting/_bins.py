@@ -63,6 +63,19 @@ class TileGrid(eqx.Module):
         """
         return min(-(-self.padded_count // (2 * self.lanes)), _HALF)
 
+    def cut(self, picture: Float[Array, "rows height width"]) -> Float[Array, "tiles rows pixels"]:
+        """Divide a picture into tiles; 0 beyond its edges."""
+        rows, height, width = picture.shape
+        whole = jnp.pad(
+            picture,
+            ((0, 0), (0, self.down * TILE_SIDE - height), (0, self.across * TILE_SIDE - width)),
+        )
+        return (
+            whole.reshape(rows, self.down, TILE_SIDE, self.across, TILE_SIDE)
+            .transpose(1, 3, 0, 2, 4)
+            .reshape(self.count, rows, TILE_SIDE**2)
+        )
+
     def join(self, tiles: Float[Array, "tiles rows pixels"]) -> Float[Array, "rows height width"]:
         """Join the tiles of a picture."""
         rows = tiles.shape[1]

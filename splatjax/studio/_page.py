@@ -72,7 +72,7 @@ class Page:
         port: int = 8080,
     ):
         try:
-            import viser  # ty: ignore[import-not-found]
+            import viser
         except ImportError:
             raise ValueError(
                 "the page of the studio needs viser; install it: pip install 'splatjax[studio]'"
@@ -91,10 +91,10 @@ class Page:
         self.url = f"http://{host}:{server.get_port()}"
         server.scene.set_up_direction("+y")
         camera = server.initial_camera
-        camera.position, camera.look_at = session.start.eye, session.start.target
+        camera.position, camera.look_at = self._place
         camera.fov = float(np.radians(session.fov))
         self._add_controls(server.gui)
-        server.on_client_connect(lambda client: client.camera.on_update(self._look))
+        server.on_client_connect(self._join)
         server.on_client_disconnect(
             lambda client: self._joined.remove(client) if client in self._joined else None
         )
@@ -207,6 +207,9 @@ class Page:
                 for channel, number in enumerate(getattr(start, field), 1)
             )
         return dataclasses.replace(start, eye=tuple(eye), target=tuple(target), **changed)
+
+    def _join(self, client: Any) -> None:
+        client.camera.on_update(self._look)
 
     def _look(self, camera: Any) -> None:
         place, start = np.asarray([camera.position, camera.look_at]), self._session.start
