@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 import splatjax as sj
 from splatjax import diffusion, splatting
-from splatjax._combination import OneDevice
+from splatjax._combination import DeviceMesh
 
 from .scenes import BODIES, MATERIALS, columns, lit
 
@@ -125,7 +125,9 @@ def main() -> None:
         seen, _ = plan.raster.choose(body, view)
 
         def diffuse(placed, targets, plan=plan):
-            return plan.diffusion.diffuse(placed, gaussians.variances, kernel, OneDevice(), targets)
+            return plan.diffusion.diffuse(
+                placed, gaussians.variances, kernel, DeviceMesh(), targets
+            )
 
         _, seconds = timed(diffuse, placed, seen)
         diffused, all_seconds = timed(diffuse, placed, None)

@@ -16,7 +16,7 @@ import numpy as np
 
 import splatjax as sj
 from splatjax import splatting
-from splatjax._combination import OneDevice
+from splatjax._combination import DeviceMesh
 
 from .scenes import BODIES, columns, lit
 from .yardstick import Yardstick
@@ -57,7 +57,7 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
         splats = splats.take(plan.raster.choose(splats, view)[0])
         rows = jnp.concatenate([splats.normals.T, splats.albedo.T])
         seen = splatting.visible_surfaces(
-            splats, rows, view, settings.splatting, plan.raster, OneDevice()
+            splats, rows, view, settings.splatting, plan.raster, DeviceMesh()
         )
         attributes = splatting.Surface.of(seen.sums, view, seen.needed).attributes
         return seen.picture(attributes), seen.picture(jnp.ones_like(seen.before))

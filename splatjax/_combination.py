@@ -52,25 +52,13 @@ class AbstractCombination(eqx.Module):
         return share
 
 
-class OneDevice(AbstractCombination):
-    """There is one part."""
-
-    def total(self, partials):
-        (whole,) = partials
-        return whole
-
-    def largest(self, partials):
-        (whole,) = partials
-        return jax.tree.map(jax.lax.stop_gradient, whole)
-
-
 class DeviceMesh(AbstractCombination):
     """Each device of a mesh, of any axes, has one part; inside `jax.shard_map`, by the collectives
-    of JAX.
+    of JAX. Without axes there is one device, and the collectives do nothing.
     """
 
-    axes: tuple[str, ...] = eqx.field(static=True)
-    count: int = eqx.field(static=True)
+    axes: tuple[str, ...] = eqx.field(static=True, default=())
+    count: int = eqx.field(static=True, default=1)
 
     @classmethod
     def of(cls, mesh: Mesh) -> "DeviceMesh":

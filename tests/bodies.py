@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import splatjax as sj
-from splatjax._combination import OneDevice
+from splatjax._combination import DeviceMesh
 from splatjax.render import RenderSettings, compute_irradiance, make_plan
 from splatjax.splatting import (
     AbstractRasterPlan,
@@ -231,7 +231,7 @@ def drawn(
     plan: AbstractRasterPlan,
 ) -> Drawn:
     """Draw both surfaces; where there is none all is 0, but the depth 1."""
-    sums = plan.sum_fragments(body, rows, view, settings, OneDevice())
+    sums = plan.sum_fragments(body, rows, view, settings, DeviceMesh())
     grid, surface = TileGrid(view.width, view.height), Surface.of(sums.sums, view, sums.needed)
     weights = sums.sums.weights
     planes = jnp.stack([surface.depth - 1, weights, coverage(weights, settings.full_coverage)], 1)

@@ -115,7 +115,7 @@ def _diffusion_basis(
     derivative: bool,
     light: SplatLight | Transfer | None,
 ) -> DiffusionBasis:
-    def layers(passes, camera, light=None):
+    def basis(passes, camera, light=None):
         def read(shaded: ShadedSurface, at: LayersAtPoints, _):
             return (
                 {name: getattr(at, name) for name in at.ALONG_POINTS},
@@ -126,17 +126,16 @@ def _diffusion_basis(
         light_at = partial(passes.light, kept=light, derivative=derivative)
         (*rows, specular), visible = passes.picture(camera, light_at, read)
         layers, per_exitance = jax.tree.map(in_a_row, rows)
-        basis = LayersAtPoints(
-            variances=passes.scene.material.gaussians.variances,
-            interval=passes.plan.interval,
-            kernel=settings.kernel,
-            **layers,
-        )
         x, y = visible.grid.columns_and_rows(visible.tiles)
         x, y = jnp.minimum(x, camera.width - 1), jnp.minimum(y, camera.height - 1)
         in_front = jnp.broadcast_to(visible.in_front[:, None], x.shape)
         return DiffusionBasis(
-            light=basis,
+            light=LayersAtPoints(
+                variances=passes.scene.material.gaussians.variances,
+                interval=passes.plan.interval,
+                kernel=settings.kernel,
+                **layers,
+            ),
             pixel_radiance_per_exitance=(
                 invalid_factor(visible.needed) * visible.share.reshape(1, -1) * per_exitance
             ),
@@ -147,7 +146,7 @@ def _diffusion_basis(
             overflow=visible.overflow,
         )
 
-    return on_devices(layers, scene, settings, plan, camera, placed=light)
+    return on_devices(basis, scene, settings, plan, camera, placed=light)
 
 
 class RelightingBasis(eqx.Module):

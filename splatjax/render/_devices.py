@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
-from splatjax._combination import AbstractCombination, DeviceMesh, OneDevice, lay_out
+from splatjax._combination import AbstractCombination, DeviceMesh, lay_out
 from splatjax.scene import AbstractLightSample, Frame, Scene, lights_by_kind
 
 from ._checks import in_one_dtype
@@ -189,7 +189,7 @@ def on_devices(
 
     given = scene, plan, whole, rows, extra
     if plan.mesh is None:
-        return run(OneDevice(), *given)
+        return run(DeviceMesh(), *given)
     mesh = DeviceMesh.of(plan.mesh)
     of_scene, of_whole = jax.tree.map(lambda _: PartitionSpec(), (scene, whole))
     of_splats, of_rows = jax.tree.map(lambda _: mesh.shares, (scene.splats, rows))
@@ -203,7 +203,7 @@ def on_devices(
     out_specs = PartitionSpec()
     if by_splat:
         shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), given)
-        results = jax.eval_shape(lambda given: run(OneDevice(), *given), shapes)
+        results = jax.eval_shape(lambda given: run(DeviceMesh(), *given), shapes)
         out_specs = along_splats(results, mesh)
     # The check of varying axes is off: custom derivatives and loops have no rules for it.
     mapped = jax.shard_map(

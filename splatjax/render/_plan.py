@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import Result, rounded_up
-from splatjax._combination import DeviceMesh, OneDevice
+from splatjax._combination import DeviceMesh
 from splatjax.cache import kept, reuse_capacity
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import (
@@ -283,7 +283,7 @@ def _measure(parts: Sequence[Splats], kernel: _diffusion.AbstractDiffusionKernel
     """Compute the bounds of the splats, and the least width of a layer that they resolve."""
     splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     interval = kernel.interval(_diffusion.unevenness(splats))
-    return _splatting.Bounds.of(splats, OneDevice()), interval
+    return _splatting.Bounds.of(splats, DeviceMesh()), interval
 
 
 def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[AbstractLightSample]]:

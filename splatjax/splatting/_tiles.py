@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import map_chunks, needed_over_planned, take_points, with_spare
-from splatjax._combination import AbstractCombination, OneDevice
+from splatjax._combination import AbstractCombination, DeviceMesh
 from splatjax._precision import full_precision
 from splatjax.cache import reuse_capacity
 from splatjax.scene import Splats
@@ -179,5 +179,5 @@ def _tiles_behind(splats: Splats, view: AbstractView, settings: SplattingSetting
     """Count the tiles in which a surface is visible behind the front."""
     chosen, _ = plan.choose(splats, view)
     no_rows = jnp.zeros((0, len(chosen)), splats.centers.dtype)
-    sums = plan.sum_fragments(splats.take(chosen), no_rows, view, settings, OneDevice())
+    sums = plan.sum_fragments(splats.take(chosen), no_rows, view, settings, DeviceMesh())
     return jnp.sum(sums.tiles[sums.front :] < plan.rasterizer.grid(view).count)

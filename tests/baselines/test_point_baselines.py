@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import splatjax as sj
-from splatjax._combination import OneDevice
+from splatjax._combination import DeviceMesh
 from splatjax.baselines import (
     BlendingRasterizer,
     DiscKernel,
@@ -56,7 +56,7 @@ def seen_by(name: str, splats: sj.Splats, *views: sj.splatting.PerspectiveView):
     plan = RASTERIZERS[name].make_plan([splats], views, SETTINGS)
 
     def draw(splats, rows, view):
-        visible = sj.splatting.visible_surfaces(splats, rows, view, SETTINGS, plan, OneDevice())
+        visible = sj.splatting.visible_surfaces(splats, rows, view, SETTINGS, plan, DeviceMesh())
         surface = sj.splatting.Surface.of(visible.sums, view, visible.needed)
         depth = jnp.where(surface.covered, surface.depth, 0.0)
         pictures = surface.attributes, visible.share, depth

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from splatjax._combination import OneDevice
+from splatjax._combination import DeviceMesh
 from splatjax.diffusion import (
     POINTS_PER_BLOCK,
     ClusterDiffuser,
@@ -64,7 +64,7 @@ def planned(diffuser, body: Splats, variances=VARIANCES):
 
 @eqx.filter_jit
 def run(plan, sources, variances):
-    diffused = plan.diffuse(sources, variances, KERNEL, OneDevice())
+    diffused = plan.diffuse(sources, variances, KERNEL, DeviceMesh())
     # Without layers that only fill up; here all others are resolved.
     return jax.tree.map(lambda rows: rows[: len(variances)], diffused.layers), diffused.needed
 
@@ -183,7 +183,7 @@ def test_gradients_are_those_of_the_plain_sum_over_the_sources_within_the_suppor
     factors = jnp.asarray(rng.normal(size=(2, 5, 4, body.count)))
 
     def fast(sources, variances, plan=plan):
-        return stacked(plan.diffuse(sources, variances, KERNEL, OneDevice()).layers)
+        return stacked(plan.diffuse(sources, variances, KERNEL, DeviceMesh()).layers)
 
     def within_support(sources, variances):
         return by_formula(sources, variances, plan.kernels.largest)
@@ -197,7 +197,7 @@ def test_gradients_are_those_of_the_plain_sum_over_the_sources_within_the_suppor
     for found, expected in zip(jax.tree.leaves(d_ours), jax.tree.leaves(d_theirs), strict=True):
         np.testing.assert_allclose(found, expected, atol=GRADIENT * float(jnp.max(abs(expected))))
     _, derivative = jax.jit(
-        lambda *given: plan.diffuse_with_derivative(*given, KERNEL, OneDevice())
+        lambda *given: plan.diffuse_with_derivative(*given, KERNEL, DeviceMesh())
     )(sources, variances)
     _, expected = jax.jvp(lambda v: within_support(sources, v), (variances,), (variances,))
     scale = GRADIENT * float(jnp.max(jnp.abs(expected)))
@@ -216,7 +216,7 @@ def test_gradients_through_clusters_are_those_of_differences(float64):
 
     @jax.jit
     def total(sources, logarithms):
-        layers = plan.diffuse(sources, jnp.exp(logarithms), KERNEL, OneDevice()).layers
+        layers = plan.diffuse(sources, jnp.exp(logarithms), KERNEL, DeviceMesh()).layers
         return jnp.vdot(factors, layers.values)
 
     given = sources, jnp.log(variances)

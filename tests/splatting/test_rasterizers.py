@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from random_bodies import KINDS, disagreement, random_body, seeds
 
-from splatjax._combination import OneDevice
+from splatjax._combination import DeviceMesh
 from splatjax.splatting import (
     BinCapacity,
     DenseRasterizer,
@@ -171,7 +171,7 @@ def test_too_small_a_capacity_makes_the_picture_nan_and_is_reported():
     ):
         tried = dataclasses.replace(plan, **short)
         make = jax.jit(make_shadow_map, static_argnums=(2, 3, 4))
-        seen = make(body, view, SETTINGS, tried, OneDevice())
+        seen = make(body, view, SETTINGS, tried, DeviceMesh())
         assert (float(seen.needed) > 1) == bool(short), short
         assert np.all(np.isnan(seen.planes) == bool(short)), short
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from splatjax._combination import OneDevice
+from splatjax._combination import DeviceMesh
 from splatjax.scene import Splats
 from splatjax.splatting import (
     TILE_SIDE,
@@ -49,7 +49,7 @@ def scene():
 
 
 def bounds_of(body) -> Bounds:
-    return Bounds.of(body, OneDevice())
+    return Bounds.of(body, DeviceMesh())
 
 
 def plan_for(view, body, rasterizer=TileRasterizer(lanes=8, slots=16)):
@@ -59,7 +59,7 @@ def plan_for(view, body, rasterizer=TileRasterizer(lanes=8, slots=16)):
 @eqx.filter_jit
 def visibility(body, view, plan, settings=SETTINGS, splatting=SPLATTING):
     """Compute how much of the light each splat gets; NaN where the plan's capacity is exceeded."""
-    shadow_map = make_shadow_map(body, view, splatting, plan, OneDevice())
+    shadow_map = make_shadow_map(body, view, splatting, plan, DeviceMesh())
     return compute_visibility(body, shadow_map, settings)
 
 
