@@ -66,17 +66,16 @@ def plot_fit(
     )
 
     figure = Figure(figsize=(10, 7.5), layout="constrained")
-    panels = figure.subplot_mosaic(
+    linear, log, residual = figure.subplot_mosaic(
         [["linear", "log"], ["residual", "residual"]], height_ratios=(3, 2)
-    )
-    linear, log, residual = panels["linear"], panels["log"], panels["residual"]
+    ).values()
 
     # What the fit is between few radii.
     dense = r if len(r) > _FEW else jnp.geomspace(r[0], r[-1], _POINTS, dtype=r.dtype)
     between, of_fit = np.asarray(dense), np.asarray(gaussians(dense), np.float64)
     parts = gaussian(gaussians.variances[None], (dense * dense)[:, None])
-    parts = parts * jnp.mean(gaussians.weights, axis=1)[None]
-    log.loglog(between, np.asarray(parts), color="0.75", linewidth=0.8, zorder=1)
+    single = np.asarray(parts * jnp.mean(gaussians.weights, axis=1)[None])
+    log.loglog(between, single, color="0.75", linewidth=0.8, zorder=1)
     marker, width = (None, 3.0) if len(r) > _FEW else ("o", 0.8)
     names = channel_names(len(error))
     for channel, color in enumerate(_colors(len(error))):

@@ -15,9 +15,8 @@ import splatjax as sj
 from splatjax._format import counted, format_numbers
 from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
-from . import _batch
-from ._fit_report import print_fit
-from ._models import Model, Reference, model_by_name, reference
+from . import _models
+from ._models import Coefficients, Model, Reference, model_by_name, print_fit, reference
 from ._terminal import (
     FIGURES,
     OptionalFloat,
@@ -132,14 +131,14 @@ class Fit:
         model = model_by_name(self.model, self.g or 0.0)
         names, coefficients = read_media(Path(self.medium))
         path = self.output.with_name(f"{self.output.name}.parts")
-        begins = range(0, len(names), _batch.BATCH)
+        begins = range(0, len(names), _models.BATCH)
         parts = [path / f"from_{begin:08}.csv" for begin in begins]
 
         def fit(i: int) -> None:
-            batch = slice(begins[i], begins[i] + _batch.BATCH)
+            batch = slice(begins[i], begins[i] + _models.BATCH)
             write_columns(
                 parts[i],
-                {"name": names[batch]} | _batch.fit_batch(coefficients[batch], self.count, model),
+                {"name": names[batch]} | _models.fit_batch(coefficients[batch], self.count, model),
             )
 
         done = complete(
@@ -155,7 +154,7 @@ class Fit:
             [(part,) for part in parts],
             lambda: fit,
             name="batches",
-            what=f"fitting {self.count} Gaussians to {len(names)} media, {_batch.BATCH} at a time",
+            what=f"fitting {self.count} Gaussians to {len(names)} media, {_models.BATCH} at a time",
         )
         if len(done) < len(parts):
             return
@@ -177,21 +176,7 @@ class Fit:
         print(self.output)
 
     def _run(self) -> None:
-        coefficients = self._coefficients()
-        if isinstance(coefficients, sj.scattering.Tabulated):
-            weights = sj.fitting.NonNegativeWeights(sj.fitting.FreeWeights())
-            target = Reference(coefficients, description="measured", weights=weights)
-            radii = len(coefficients.radii)
-            if self.error is None and 2 * self.count > radii:
-                note(
-                    f"{self.medium} has {radii} radii, too few to determine "
-                    f"{counted(self.count, 'Gaussian')}; give a smaller --count"
-                )
-        else:
-            # A dipole depends only on the reduced coefficients.
-            knows = self.g is not None or self.model not in ("dipole", "better-dipole")
-            g = self._mean_cosine() if knows else 0.0
-            target = reference(coefficients, self.model, self.photons, g, self.single_scattering)
+        known, target = self._target()
         fitted = self._fitted(target)
         print_fit(fitted, target)
         self._note_spread(target, fitted)
@@ -202,7 +187,7 @@ class Fit:
                 "it receives; check its unit and power"
             )
         if self.output is not None:
-            self._save(self.output, coefficients, target, fitted)
+            self._save(self.output, known, target, fitted)
             print(self.output)
         if self.plot is not None:
             from splatjax.plots import plot_fit  # loads matplotlib
@@ -222,10 +207,10 @@ class Fit:
                 f"or --error {_LARGE}"
             )
 
-    def _coefficients(
-        self,
-    ) -> sj.Dipole | sj.LayeredMultipole | sj.scattering.Skin | sj.scattering.Tabulated:
-        """Read the input; raise for options without effect on its kind."""
+    def _target(self) -> tuple[Coefficients | None, Reference]:
+        """Read the input, and make its profile: the coefficients, `None` where it is measured, and
+        what is fitted; raise for options without effect on the kind of input.
+        """
         kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
         given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
         for other, names in _OPTIONS.items():
@@ -235,18 +220,30 @@ class Fit:
                     f"{option_name(without_effect[0])} is for {other}, and {self.medium} is "
                     f"read as {kind}; leave it out"
                 )
-        if kind == _PROFILE:
-            return sj.io.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
         if kind == _COEFFICIENTS:
-            return sj.load_profile(self.medium)
-        if self.mm_per_pixel is None:
+            known = sj.load_profile(self.medium)
+            # A dipole depends only on the reduced coefficients.
+            knows = self.g is not None or self.model not in ("dipole", "better-dipole")
+            g = self._mean_cosine() if knows else 0.0
+            return known, reference(known, self.model, self.photons, g, self.single_scattering)
+        if kind == _PROFILE:
+            measured = sj.io.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
+        elif self.mm_per_pixel is None:
             raise ValueError(
                 f"{self.medium}: the size of a pixel on the surface is unknown; give --mm-per-pixel"
             )
-        image = sj.io.read_picture(self.medium)
-        with sj.io.naming(self.medium):
-            dot = sj.scattering.measure_laser_dot(image, self.mm_per_pixel, power=self.power)
-            return dot.profile
+        else:
+            image = sj.io.read_picture(self.medium)
+            with sj.io.naming(self.medium):
+                dot = sj.scattering.measure_laser_dot(image, self.mm_per_pixel, power=self.power)
+            measured = dot.profile
+        if self.error is None and 2 * self.count > len(measured.radii):
+            note(
+                f"{self.medium} has {len(measured.radii)} radii, too few to determine "
+                f"{counted(self.count, 'Gaussian')}; give a smaller --count"
+            )
+        weights = sj.fitting.NonNegativeWeights(sj.fitting.FreeWeights())
+        return None, Reference(measured, description="measured", weights=weights)
 
     def _fitted(self, target: Reference) -> sj.fitting.FitResult:
         count = self.count if self.error is None else sj.fitting.LeastCount(self.error)
@@ -271,14 +268,10 @@ class Fit:
     def _save(
         self,
         output: Path,
-        coefficients: sj.Dipole
-        | sj.LayeredMultipole
-        | sj.scattering.Skin
-        | sj.scattering.Tabulated,
+        known: Coefficients | None,
         target: Reference,
         fitted: sj.fitting.FitResult,
     ) -> None:
-        known = None if isinstance(coefficients, sj.scattering.Tabulated) else coefficients
         surface, source = dict[str, Any](), dict[str, Any]()
         if known is not None:
             # The index of a surface is that of the medium it bounds, unless the file gives it.

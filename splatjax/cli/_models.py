@@ -1,16 +1,23 @@
-"""The models of `docs/which_profile.md` by name: what `splatjax fit` makes of coefficients."""
+"""What `splatjax fit` makes of coefficients: the models of `docs/which_profile.md` by name, fits of
+many media by one program for `--all`, and the report of a fit.
+"""
 
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
 
 import splatjax as sj
 
-from ._terminal import stage
+from ._terminal import print_table, stage
 
 Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carlo"]
+Coefficients: TypeAlias = sj.Dipole | sj.LayeredMultipole | sj.scattering.Skin
 # Weights of the fit to a medium: the picture keeps its energy.
 MEDIUM_WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 _BEYOND = sj.fitting.TransportModel.rule
@@ -49,7 +56,7 @@ class Reference:
 
 
 def reference(
-    coefficients: sj.Dipole | sj.LayeredMultipole | sj.scattering.Skin,
+    coefficients: Coefficients,
     model: Model | None,
     photons: int,
     g: float,
@@ -144,3 +151,93 @@ def _walked(
     single, angles = _parted(half_space)
     description += ", without single scattering"
     return Reference(profile.without(single), _BEYOND, single, description, angles)
+
+
+BATCH = 500  # media in one call
+
+
+@eqx.filter_jit
+def _fit_each(
+    coefficients: Float[Array, "media 3"],
+    starts: sj.fitting.DipoleStarts,
+    count: int,
+    model: sj.fitting.AbstractModel,
+):
+    def fit(row):
+        medium = sj.Medium(row[0:1], row[1:2], row[2:3])
+        fitted = sj.fit_gaussians(
+            model.profile(medium),
+            count,
+            start=sj.fitting.GivenVariances(starts(medium, count).variances[0]),
+            weights=MEDIUM_WEIGHTS,
+            rule=model.rule,
+            throw=False,
+        )
+        return fitted, model.angles(medium), fitted.result == optx.RESULTS.successful
+
+    return eqx.filter_vmap(fit)(coefficients)
+
+
+def fit_batch(
+    coefficients: np.ndarray, count: int, model: sj.fitting.AbstractModel
+) -> dict[str, np.ndarray]:
+    """Return the columns of a batch. A smaller batch is padded, so that one program serves all. The
+    starts of fits to dipoles are near the optima of other models of the same media.
+    """
+    given = len(coefficients)
+    padded = np.pad(coefficients, ((0, BATCH - given), (0, 0)), mode="edge")
+    fitted, angles, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count, model)
+    powers = [] if angles is None else angles.coefficients[..., 0].T
+    columns = {
+        **dict(zip(("sigma_a", "sigma_s_prime", "eta"), padded.T, strict=True)),
+        **{f"variance_{i + 1}": fitted.gaussians.variances[:, i] for i in range(count)},
+        **{f"weight_{i + 1}": fitted.gaussians.weights[:, i, 0] for i in range(count)},
+        **{f"angles_{power}": column for power, column in enumerate(powers)},
+        "error": fitted.error[:, 0],
+        "energy_error": fitted.energy_error[:, 0],
+        "converged": converged.astype(float),
+    }
+    return {name: np.asarray(column)[:given] for name, column in columns.items()}
+
+
+_DISTANCES = 7
+
+
+def print_fit(fitted: sj.fitting.FitResult, target: Reference) -> None:
+    """Print the Gaussians of a fit, their errors, and the relative error by distance."""
+    print_table(
+        [
+            *fitted.table(),
+            ("at r, mm", "fit over profile, less 1"),
+            *_errors_by_distance(target.profile, fitted.gaussians, target.rule),
+        ]
+    )
+
+
+def _errors_by_distance(
+    profile: sj.gaussians.AbstractProfile,
+    gaussians: sj.SumOfGaussians,
+    rule: sj.scattering.AbstractRadialRule,
+) -> list[tuple[str, str]]:
+    """Return rows of relative errors, from where a fit counts to where all channels have a
+    hundredth of the peak of their light by logarithmic radius.
+    """
+    nodes, weights = (np.asarray(each) for each in rule.radii(profile))
+    known = profile.known_radii()
+    least = max(nodes[weights > 0].min(), 0.1 * float(profile.length_scale().min()))
+    dense = jnp.geomspace(least, nodes.max(), 400) if known is None else known[0][known[0] > 0]
+    light = np.asarray(dense)[:, None] ** 2 * np.asarray(profile(dense))
+    counts = light > 0.01 * light.max(axis=0)
+    within = np.flatnonzero(counts.any(axis=1))
+    places = np.unique(np.linspace(within[0], within[-1], _DISTANCES).round().astype(int))
+    errors = np.asarray(gaussians(dense) / profile(dense) - 1)
+    return [
+        (
+            f"{float(dense[i]):.3g}",
+            "  ".join(
+                f"{error:+.1%}" if counted else "-"
+                for error, counted in zip(errors[i], counts[i], strict=True)
+            ),
+        )
+        for i in places
+    ]

@@ -52,12 +52,18 @@ class Render(ViewOptions):
     def run(self) -> None:
         check_output(self.output, (".exr",))
         self.check()
-        is_valid = self.stream == 0 or (self.stream > 0 and self.splats is not None)
-        expected = "be a number of splats, with a PLY file as input"
-        bounces = self.stream == 0 or self.bounces == 0, "be 0 with --stream"
-        diffusion = self.stream == 0 or self.diffusion == "clusters", "be clusters with --stream"
-        rules = {"stream": (is_valid, expected), "bounces": bounces, "diffusion": diffusion}
-        check_options(self, rules)
+        if self.stream != 0:
+            check_options(
+                self,
+                {
+                    "stream": (
+                        self.stream > 0 and self.splats is not None,
+                        "be a number of splats, with a PLY file as input",
+                    ),
+                    "bounces": (self.bounces == 0, "be 0 with --stream"),
+                    "diffusion": (self.diffusion == "clusters", "be clusters with --stream"),
+                },
+            )
         rendered = self._streamed(self.splats) if self.splats and self.stream else self._at_once()
         self.note_unresolved_layers(*rendered[:2])
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):

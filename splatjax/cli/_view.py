@@ -161,9 +161,11 @@ class ViewOptions:
 
     @property
     def settings(self) -> sj.RenderSettings:
-        clusters, shape = sj.diffusion.ClusterDiffuser(), sj.diffusion.ShapeDiffuser()
-        diffuser = shape if self.diffusion == "shape" else clusters
-        return sj.RenderSettings(bounces=self.bounces, diffuser=diffuser)
+        diffusers = {
+            "clusters": sj.diffusion.ClusterDiffuser(),
+            "shape": sj.diffusion.ShapeDiffuser(),
+        }
+        return sj.RenderSettings(bounces=self.bounces, diffuser=diffusers[self.diffusion])
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
@@ -210,10 +212,7 @@ class ViewOptions:
         first_azimuth, elevation, fill = self.single_light
         if self._environment is not None:
             rotation = self.environment_rotation + light_azimuth - first_azimuth
-            image = self._environment.image
-            if material.channels == 1:
-                image = jnp.mean(image, axis=-1, keepdims=True)
-            return (sj.EnvironmentLight(image, rotation),)
+            return (sj.EnvironmentLight(self._environment.image, rotation),)
         # The first light gives a white diffuser that faces it the radiance 1.
         irradiance = np.full(material.channels, np.pi)
         towards = -direction_to(light_azimuth, elevation)
@@ -261,8 +260,7 @@ class ViewOptions:
         if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
             shown = np.asarray(lights[0].behind(frame, camera))
         elif self.background == "transparent":
-            gray = np.repeat(shown, 3 // shown.shape[-1], axis=-1)
-            shown = np.concatenate([gray, np.asarray(frame.coverage)[..., None]], axis=-1)
+            shown = np.concatenate([shown, np.asarray(frame.coverage)[..., None]], axis=-1)
         sj.write_png(picture, shown, exposure=self.exposure)
         return path, picture
 

@@ -32,11 +32,11 @@ from ._materials import (
     save_material as save_material,
     surface_and_source as surface_and_source,
 )
-from ._spectra import spectrum_to_rgb as spectrum_to_rgb
 from ._tables import (
     read_columns as read_columns,
     read_media as read_media,
     read_profile as read_profile,
+    spectrum_to_rgb as spectrum_to_rgb,
     write_columns as write_columns,
 )
 from ._cameras import load_cameras as load_cameras

@@ -106,17 +106,17 @@ def load_material(name_or_path: StrPath) -> Material:
         "positive: variances ascend",
         lambda x: x > 0,
     )
-    single = None
+    terms: dict[str, Any] = dict(_surface(tables))
+    if isinstance(profile, Dipole):
+        terms["medium"] = profile.medium
     if "single_scattering" in tables.entries:
         table = tables.table("single_scattering", (*MEDIUM_ENTRIES, "strength"))
         single = table.make(SingleScattering, medium_of(table), table.numbers("strength", 1.0))
-    angles = None
+        terms["single_scattering"] = single
     if "angles" in tables.entries:
         table = tables.table("angles", ("coefficients",))
-        angles = table.make(AngularLaw, table.numbers("coefficients"))
-    medium = profile.medium if isinstance(profile, Dipole) else None
-    terms = {"single_scattering": single, "angles": angles, "medium": medium}
-    return fit.make(Material, gaussians, **_surface(tables), **terms)
+        terms["angles"] = table.make(AngularLaw, table.numbers("coefficients"))
+    return fit.make(Material, gaussians, **terms)
 
 
 def surface_and_source(
@@ -211,12 +211,8 @@ def save_material(
         tables["skin"] = plain_skin(profile)
     elif isinstance(profile, LayeredMultipole):
         tables["layers"] = [plain_layer(layer) for layer in profile.layers]
-    elif profile is not None:
-        tables["medium"] = plain_medium(profile.medium)
-    elif material.medium is not None:
-        tables["medium"] = plain_medium(material.medium)
-    if g and "medium" in tables:
-        tables["medium"]["g"] = g
+    elif (medium := material.medium if profile is None else profile.medium) is not None:
+        tables["medium"] = plain_medium(medium) | ({"g": g} if g else {})
     single, gaussians = material.single_scattering, material.gaussians
     if single is not None:
         tables["single_scattering"] = {

@@ -98,10 +98,11 @@ def plain_layer(layer: Layer | Film) -> dict[str, Any]:
 
 def skin_of(table: Table) -> Skin:
     """Make the skin of a table; missing entries have the defaults of `Skin`."""
-    numbers = {name: table.number(name) for name in table.entries if name != "wavelengths"}
-    if "wavelengths" in table.entries:
-        return table.make(Skin, **numbers, wavelengths=table.numbers("wavelengths"))
-    return table.make(Skin, **numbers)
+    values = {
+        name: table.numbers(name) if name == "wavelengths" else table.number(name)
+        for name in table.entries
+    }
+    return table.make(Skin, **values)
 
 
 def plain_skin(skin: Skin) -> dict[str, Any]:

@@ -241,7 +241,7 @@ def _splat_fields(
         for name, column in columns.items()
         if column.dtype.kind in "iuf" and column.ndim == 1
     }
-    fields: dict[str, Any] = dict.fromkeys(_COLUMNS)
+    fields: dict[str, Any] = dict.fromkeys([*_COLUMNS, "weights"])
     for field, aliases in _COLUMNS.items():
         names = next((names for names in aliases if single.keys() & set(names)), aliases[0])
         if single.keys() >= set(names):
@@ -254,7 +254,6 @@ def _splat_fields(
             )
     matches = [match for match in map(_WEIGHT.fullmatch, single) if match]
     factors = sorted((tuple(map(int, match.groups())), match[0]) for match in matches)
-    fields["weights"] = None
     if factors:
         shape = factors[-1][0]
         if [place for place, _ in factors] != [(k + 1, c + 1) for k, c in np.ndindex(shape)]:

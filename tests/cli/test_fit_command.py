@@ -16,7 +16,7 @@ from pictures import write_picture
 from PIL import Image
 
 import splatjax as sj
-from splatjax.cli import _batch, _fit, _models
+from splatjax.cli import _fit, _models
 
 pytestmark = pytest.mark.once
 
@@ -206,7 +206,7 @@ def media(tmp_path):
 def test_a_table_of_media_becomes_a_table_of_fits_and_is_continued(
     media, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(_batch, "BATCH", 2)
+    monkeypatch.setattr(_models, "BATCH", 2)
     output = tmp_path / "fits.csv"
     words = ["fit", media, "--all", "--count", 2, "--output", output]
     with monkeypatch.context() as patch:
@@ -236,6 +236,6 @@ def test_a_table_of_media_becomes_a_table_of_fits_and_is_continued(
 
 def test_it_reports_how_many_did_not_converge(media, tmp_path, monkeypatch, capsys):
     columns = {"error": np.zeros(5), "converged": np.asarray([1.0, 0.0, 1.0, 1.0, 0.0])}
-    monkeypatch.setattr(_batch, "fit_batch", lambda *_: columns)
+    monkeypatch.setattr(_models, "fit_batch", lambda *_: columns)
     assert run("fit", media, "--all", "--output", tmp_path / "fits.csv") == 0
     assert "2 of 5 fits" in capsys.readouterr().err
