@@ -38,6 +38,8 @@ Function = TypeVar("Function", bound=Callable)
 
 _LARGEST = 1 << 30  # bytes in the folder, beyond which what was not used for longest is deleted
 _EFFECTLESS = re.compile("cache|log|platform")  # settings of JAX that no result depends on
+# Events of JAX when its cache lacks a small program, and of this module before a picture's.
+COMPILING = "/jax/compilation_cache/cache_misses", "/splatjax/cache/compiling"
 _LEAST_TIME = "jax_persistent_cache_min_compile_time_secs"
 # JAX's settings, unless its environment variables decide otherwise.
 _SETTINGS = {
@@ -156,7 +158,7 @@ def kept_jit(function: Function) -> Function:
 def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
     arrays, static = eqx.partition(arguments, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
-    jax.monitoring.record_event("/splatjax/cache/compiling")
+    jax.monitoring.record_event(COMPILING[1])
 
     # Of a list of arrays: a program that is loaded cannot make records of its arguments.
     def of_leaves(leaves):

@@ -17,6 +17,7 @@ import tyro
 from jax.extend.backend import clear_backends
 from rich.console import Console
 
+from splatjax.cache import COMPILING
 from splatjax.io import atomic_path, read_record, write_record
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
@@ -98,10 +99,6 @@ def stage(what: str, total: int = 0) -> Generator[Callable[..., None]]:
     note(f"{what}: {time.perf_counter() - begin:.1f} s")
 
 
-# What JAX reports when its cache lacks a small program, and `splatjax.cache` before a picture's.
-_COMPILING = "/jax/compilation_cache/cache_misses", "/splatjax/cache/compiling"
-
-
 @contextlib.contextmanager
 def preview(draw: Callable[[int], list]) -> Generator[None]:
     """Show a small picture when the first compilation starts, once, if stderr is a terminal with
@@ -115,7 +112,7 @@ def preview(draw: Callable[[int], list]) -> Generator[None]:
     pending = [draw]
     jax.monitoring.register_event_listener(
         listen := lambda event, **_: (
-            _show(pending.pop()) if pending and event in _COMPILING else None
+            _show(pending.pop()) if pending and event in COMPILING else None
         )
     )
     try:

@@ -40,10 +40,10 @@ from ._tables import (
     write_columns as write_columns,
 )
 from ._cameras import load_cameras as load_cameras
-from ._gltf import load_lights as load_lights
 from ._meshes import read_textured_mesh as read_textured_mesh, sample_mesh as sample_mesh
 from ._lights import (
     load_environment as load_environment,
+    load_lights as load_lights,
     picture_paths as picture_paths,
     read_observations as read_observations,
 )

@@ -2,6 +2,7 @@
 
 import json
 import struct
+import warnings
 from collections.abc import Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
@@ -13,7 +14,6 @@ from jaxtyping import Float
 from splatjax.scene import Camera
 
 from ._files import StrPath, check_units, existing_file, with_y_up
-from ._gltf import gltf_cameras
 from ._images import read_planes
 from ._trimesh import one_sentence
 
@@ -30,6 +30,8 @@ _MODELS = {
     "RADIAL": ("fl_x", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
+_ROWS = 512  # of a picture, whose size glTF does not specify
+_LIGHTS = "KHR_lights_punctual"
 
 
 def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[str, Camera]:
@@ -55,7 +57,7 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
     """
     path, cameras = Path(path), {}
     check_units(path, mm_per_unit, up)
-    readers = {".json": _transforms, ".gltf": gltf_cameras, ".glb": gltf_cameras, ".exr": _picture}
+    readers = {".json": _transforms, ".gltf": _gltf, ".glb": _gltf, ".exr": _picture}
     reader = _colmap if path.is_dir() else readers.get(existing_file(path).suffix.lower())
     if reader is None:
         known = "transforms.json, glTF, OpenEXR, or a folder of COLMAP"
@@ -173,3 +175,47 @@ def _picture(path: Path) -> _Found:
     lens = {"w": width, "h": height, "fl_x": focal_x * width, "fl_y": -focal_y * height}
     pose = np.linalg.inv(np.diag([1, -1, 1, 1]) @ to_camera.T)
     yield path.name, lens | {"cx": x * width, "cy": y * height}, pose
+
+
+def gltf_nodes(path: Path, kind: str) -> _Found:
+    """Yield name, contents and transformation to the world of all nodes with a camera or light,
+    which trimesh leaves out.
+    """
+    from trimesh.transformations import quaternion_matrix, translation_matrix  # takes a second
+
+    data = path.read_bytes()
+    is_binary = data[:4] == b"glTF"
+    content = json.loads(data[20:][: int.from_bytes(data[12:16], "little")] if is_binary else data)
+
+    def part(of: dict[str, Any]) -> dict[str, Any]:
+        return of if kind == "camera" else of.get("extensions", {}).get(_LIGHTS, {})
+
+    def place(index: int, above: np.ndarray) -> _Found:
+        node = content["nodes"][index]
+        x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+        moved = translation_matrix(node.get("translation", (0, 0, 0)))
+        turned = moved @ quaternion_matrix([w, x, y, z]) @ np.diag([*node.get("scale", [1] * 3), 1])
+        given = np.reshape(node.get("matrix", turned.T), (4, 4)).T
+        if kind in part(node):
+            found = part(content)[f"{kind}s"][part(node)[kind]]
+            yield node.get("name", f"{kind} {index}"), found, above @ given
+        for child in node.get("children", ()):
+            yield from place(child, above @ given)
+
+    for root in content["scenes"][content.get("scene", 0)].get("nodes", ()):
+        yield from place(root, np.eye(4))
+
+
+def _gltf(path: Path) -> _Found:
+    """Yield name, lens and pose (camera to world; right, down and forward) of perspective cameras.
+    Others are left out with a warning.
+    """
+    for name, camera, matrix in gltf_nodes(path, "camera"):
+        if camera["type"] == "perspective":
+            lens = camera["perspective"]
+            focal, width = 0.5 * _ROWS / np.tan(0.5 * lens["yfov"]), lens.get("aspectRatio", 1.0)
+            size = {"w": round(_ROWS * width), "h": _ROWS}
+            yield name, {"fl_x": focal, **size}, matrix * [1, -1, -1, 1]
+        else:
+            left_out = f"the camera {name!r} is {camera['type']}, and is left out"
+            warnings.warn(f"{path}: {left_out}", stacklevel=2)

@@ -1,5 +1,8 @@
-"""Environments from files, and TOML files that list pictures with their cameras and lights."""
+"""Environments and lights from files, and TOML files that list pictures with their cameras and
+lights.
+"""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +22,11 @@ from splatjax.scene import (
     SphereLight,
 )
 
-from ._files import StrPath, naming
+from ._cameras import gltf_nodes
+from ._files import StrPath, check_units, existing_file, naming, with_y_up
 from ._images import read_picture
 from ._tables import Table, read_toml
+from ._trimesh import one_sentence
 
 _MOST_ROWS = 512  # of an environment
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
@@ -51,6 +56,39 @@ def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
         image = image.reshape(len(image) // 2, 2, image.shape[1] // 2, 2, -1).mean(axis=(1, 3))
     with naming(path):
         return EnvironmentLight(image.astype(np.float32), **fields)
+
+
+def load_lights(
+    path: StrPath, *, mm_per_unit: float, up: str = "y", lux: float = 1.0
+) -> list[AbstractLight]:
+    r"""Read the punctual lights of a glTF or GLB file (KHR_lights_punctual).
+
+    A surface that faces a directional light of 1 lux receives the irradiance `lux`, and so does
+    one that is 1 unit of length from a point light of 1 candela: with `lux` 1, pictures are in
+    candela per square meter. Spot lights are read as point lights, with a warning.
+
+    **Arguments:**
+
+    - `mm_per_unit`: length of the file's unit, mm; glTF prescribes meters (1000).
+    - `up`: the file's upward axis, `"y"` or `"z"`; lights have +y up.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read.
+    """
+    path, lights = existing_file(path), []
+    check_units(path, mm_per_unit, up)
+    with one_sentence(path):
+        for name, light, matrix in gltf_nodes(path, "light"):
+            color = np.asarray(light.get("color", (1, 1, 1))) * lux * light.get("intensity", 1)
+            place, way = with_y_up(np.stack([matrix[:3, 3], -matrix[:3, 2]]), up)
+            if light["type"] == "directional":
+                lights.append(DirectionalLight(direction=way, irradiance=color))
+            else:
+                intensity = mm_per_unit**2 * color
+                lights.append(PointLight(position=mm_per_unit * place, intensity=intensity))
+            if light["type"] == "spot":
+                read_as = f"the light {name!r} is a spot, and is read as a point light"
+                warnings.warn(f"{path}: {read_as}", stacklevel=2)
+    return lights
 
 
 def read_observations(path: StrPath) -> list[Observation]:

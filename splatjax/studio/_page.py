@@ -16,6 +16,7 @@ from PIL import Image, ImageOps
 
 from splatjax._display import to_display
 from splatjax._format import channel_names, format_numbers
+from splatjax.cache import COMPILING
 from splatjax.inverse import Observation
 from splatjax.scattering import Medium
 
@@ -28,7 +29,6 @@ _STILL = 0.15  # s without a change, after which the whole picture is computed
 _NEAR = 1e-5  # relative, of cameras that are the same
 _QUALITY = 92  # of JPEG
 _MOST = 4.0  # powers of 2
-_COMPILING = "/jax/compilation_cache/cache_misses", "/splatjax/cache/compiling"
 _SLIDERS = {
     "turn": ("turn lights, °", -180.0, 180.0),
     "exposure": ("exposure, stops", -8.0, 8.0),
@@ -239,7 +239,7 @@ class Page:
             self._send(client)
 
     def _note_compiling(self, event: str, **_: Any) -> None:
-        if event in _COMPILING and threading.current_thread() is self._worker:
+        if event in COMPILING and threading.current_thread() is self._worker:
             self._status.content = "compiling, which the next start has at once ..."
 
     def _work(self) -> None:
