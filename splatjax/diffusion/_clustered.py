@@ -299,11 +299,8 @@ class StreamedDiffusion:
     def _add_part(self, sums: Float[Array, "layers values points"], sources: Sources):
         # Test by boxes whether any point is in reach; sources are below their splats.
         around = Boxes.around(sources.centers, sources.areas > 0, len(sources.areas))
-        corners = (
-            (np.asarray(boxes.low), np.asarray(boxes.high)) for boxes in (self.boxes, around)
-        )
         reach = np.max(self.reaches + np.asarray(self.depths, np.float64))
-        if not pairs_in_reach(*corners, reach)[0].size:
+        if not pairs_in_reach(self.boxes.corners, around.corners, reach)[0].size:
             return sums
         order = compact_order(np.asarray(sources.centers.T))
         sources = jax.tree.map(lambda rows: rows[..., order], sources.of_layers(self.gaussians))

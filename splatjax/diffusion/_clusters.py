@@ -141,10 +141,8 @@ def nested_cells(
             _sums(parent, members[:, None] * rows) / inside[:, None] for rows in (positions, facing)
         )
         order = compact_order(positions)
-        rank = np.empty(len(order), np.int32)
-        rank[order] = np.arange(len(order), dtype=np.int32)
         positions, facing, members = positions[order], facing[order], inside[order]
-        of_splats = rank[parent][of_splats]
+        of_splats = np.argsort(order)[parent][of_splats]
         own = np.zeros(len(exists), np.int32)
         own[exists] = of_splats
         levels.append((own, len(order)))
@@ -165,12 +163,8 @@ def _split_by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
     is_split[groups[backs]] = True
     chosen = np.flatnonzero(is_split[groups])
     own, ways = (np.cumsum(is_split) - 1)[groups[chosen]], facing[chosen]
-    rows, columns = np.triu_indices(3)
-    products = np.empty((np.sum(is_split), 3, 3))
-    products[:, rows, columns] = products[:, columns, rows] = _sums(
-        own, ways[:, rows] * ways[:, columns]
-    )
-    axes = np.linalg.eigh(products)[1][:, :, -1]
+    products = _sums(own, (ways[:, :, None] * ways[:, None]).reshape(-1, 9))
+    axes = np.linalg.eigh(products.reshape(-1, 3, 3))[1][:, :, -1]
     sides = 2 * groups
     sides[chosen] += np.sum(ways * axes[own], axis=1) < 0
     return (np.cumsum(np.bincount(sides) > 0) - 1)[sides]

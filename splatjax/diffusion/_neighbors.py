@@ -99,6 +99,11 @@ class Boxes(eqx.Module):
         )
         return cls(jnp.min(low, axis=2).T, jnp.max(high, axis=2).T)
 
+    @property
+    def corners(self) -> Corners:
+        """The low and the high corners, for NumPy."""
+        return np.asarray(self.low), np.asarray(self.high)
+
     def beyond(self, planned: "Boxes") -> Float[Array, " blocks"]:
         """Measure the distance (mm, along an axis) by which each box exceeds the planned one."""
         out = jnp.maximum(planned.low - self.low, self.high - planned.high)
@@ -125,8 +130,8 @@ def find_neighbors(
     - `parts`: equal parts of the points, each with separate lists, one after the other.
     - `least`: rows of each part.
     """
-    low, high = (np.asarray(each) for each in (sources.low, sources.high))
-    corners = (np.split(np.asarray(corner), parts) for corner in (points.low, points.high))
+    low, high = sources.corners
+    corners = (np.split(corner, parts) for corner in points.corners)
     own = [np.flatnonzero(np.asarray(layers) == layer) for layer in range(len(reaches))]
     blocks = len(points.low) // parts
     lists = blocks * len(reaches)  # of a part
