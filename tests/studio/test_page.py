@@ -70,7 +70,7 @@ def test_it_shows_itself_in_a_notebook(page):
 
 @pytest.mark.long
 def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp_path):
-    """Of a picture of the page's own, by which the search is exact."""
+    """Of a small picture of the page's own, whose error bars are 5 to 14%."""
     session = page._session
     start = session.start
     darker = tuple(1.5 * number for number in start.sigma_a)
@@ -85,7 +85,7 @@ def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp
     press(searching._controls())
     wait_until(lambda: "error bars" in searching._stage.content)
     powers = [searching._handles[f"sigma_a {channel}"].value for channel in (1, 2, 3)]
-    np.testing.assert_allclose(powers, np.log2(1.5), atol=0.02)
+    np.testing.assert_allclose(powers, np.log2(1.5), atol=0.06)
     wait_until(lambda: searching._status.content == "")
     difference = searching._compared.image[:, SIDE:].astype(int) - 128
     assert np.abs(difference).max() <= 1
