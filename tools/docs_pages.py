@@ -15,7 +15,7 @@ import pkgutil
 import posixpath
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -156,32 +156,34 @@ def _notebook(path: Path) -> tuple[str, dict[str, bytes]]:
 def _api_pages() -> Iterator[tuple[str, str]]:
     """Yield a page for each package, and a list of what `import splatjax` gives."""
     order = " ".join(GROUPS.values()).split()
-    others = [name for name in _public("splatjax") if name not in order]
+    public = _public("splatjax")
+    others = [name for name in public if name not in order]
     lines = [
         "# API",
         "What `import splatjax as sj` gives. These names are stable; others may change.",
     ]
     for title, words in (*GROUPS.items(), *([("Others", " ".join(others))] if others else [])):
-        lines += [f"## {title}", _table("splatjax", words.split())]
-    lines += ["## Packages", _table("splatjax", PACKAGES)]
+        lines += [f"## {title}", _table({name: public[name] for name in words.split()})]
+    packages = {package: importlib.import_module(f"splatjax.{package}") for package in PACKAGES}
+    lines += ["## Packages", _table(packages)]
     yield "api/index.md", "\n\n".join(lines) + "\n"
-    for package in PACKAGES:
-        home = f"splatjax.{package}"
+    for package, module in packages.items():
+        values, home = _public(module.__name__), module.__name__
         rank = {name: place for place, name in enumerate([*order, *others])}
-        names = sorted(_public(home), key=lambda each: (rank.get(each, 99), each[:8] == "Abstract"))
-        text = inspect.getdoc(importlib.import_module(home))
+        names = sorted(values, key=lambda each: (rank.get(each, 99), each[:8] == "Abstract"))
+        table = _table({name: values[name] for name in names}, home)
         full = "\n".join(f"::: {home}.{name}\n" for name in names)
-        yield f"api/{package}.md", f"# `{home}`\n\n{text}\n\n{_table(home, names)}\n\n{full}"
+        text = f"# `{home}`\n\n{inspect.getdoc(module)}\n\n{table}\n\n{full}"
+        yield f"api/{package}.md", text
 
 
-def _table(home: str, names: Iterable[str]) -> str:
-    """Return a table of names of a module, each with the first sentence of its documentation."""
+def _table(values: dict[str, Any], home: str = "") -> str:
+    """Return a table of names, each with the first sentence of its documentation."""
     rows = ["| | |", "| --- | --- |"]
-    for name in names:
-        value = pkgutil.resolve_name(f"{home}.{name}")
+    for name, value in values.items():
         sentence = re.split(r"(?<!Eq)\.(?:\s|$)|\n\n", inspect.getdoc(value) or "")[0]
-        package = getattr(value, "__module__", "").split(".")[1:2] if home == "splatjax" else []
-        link = f"[{'.'.join([home, *package, name])}]" if callable(value) else f"({name}.md)"
+        package = home or ".".join(getattr(value, "__module__", "").split(".")[:2])
+        link = f"({name}.md)" if inspect.ismodule(value) else f"[{package}.{name}]"
         rows.append(f"| [`{name}`]{link} | {' '.join(sentence.split())} |")
     return "\n".join(rows)
 
