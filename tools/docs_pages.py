@@ -157,7 +157,7 @@ def _api_pages() -> Iterator[tuple[str, str]]:
     """Yield a page for each package, and a list of what `import splatjax` gives."""
     order = " ".join(GROUPS.values()).split()
     public = _public("splatjax")
-    others = [name for name in public if name not in order]
+    order += (others := [name for name in public if name not in order])
     lines = [
         "# API",
         "What `import splatjax as sj` gives. These names are stable; others may change.",
@@ -169,12 +169,16 @@ def _api_pages() -> Iterator[tuple[str, str]]:
     yield "api/index.md", "\n\n".join(lines) + "\n"
     for package, module in packages.items():
         values, home = _public(module.__name__), module.__name__
-        rank = {name: place for place, name in enumerate([*order, *others])}
-        names = sorted(values, key=lambda each: (rank.get(each, 99), each[:8] == "Abstract"))
+        names = sorted(
+            values,
+            key=lambda name: (
+                order.index(name) if name in order else len(order),
+                name.startswith("Abstract"),
+            ),
+        )
         table = _table({name: values[name] for name in names}, home)
-        full = "\n".join(f"::: {home}.{name}\n" for name in names)
-        text = f"# `{home}`\n\n{inspect.getdoc(module)}\n\n{table}\n\n{full}"
-        yield f"api/{package}.md", text
+        full = "\n\n".join(f"::: {home}.{name}" for name in names)
+        yield f"api/{package}.md", f"# `{home}`\n\n{inspect.getdoc(module)}\n\n{table}\n\n{full}\n"
 
 
 def _table(values: dict[str, Any], home: str = "") -> str:
