@@ -76,8 +76,8 @@ mutants: setup
 	$(BIN)/cosmic-ray exec out/mutants.toml out/mutants.sqlite
 	$(BIN)/cr-report --show-diff out/mutants.sqlite | grep -A 30 SURVIVED || echo every fault was noticed
 
-# Which statements and branches of the package the float32 suite executes: a table in out/coverage.txt. Tracing makes the suite
-# slower, so this is not part of `make test`.
+# Which statements and branches of the package the float32 suite executes: a table in out/coverage.txt. Tracing makes tests
+# take 40% more processor time, so a weekly workflow runs this, and `make test` does not.
 coverage: setup
 	rm -f out/.coverage*
 	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(BIN)/coverage run -m pytest -q -n $(WORKERS) --dist loadfile -m "not long"

@@ -185,7 +185,7 @@ def _table(values: dict[str, Any], home: str = "") -> str:
     """Return a table of names, each with the first sentence of its documentation."""
     rows = ["| | |", "| --- | --- |"]
     for name, value in values.items():
-        sentence = re.split(r"(?<!Eq)\.(?:\s|$)|\n\n", inspect.getdoc(value) or "")[0]
+        sentence = re.split(r"(?<!Eq)(?<!\.)\.(?:\s|$)|\n\n", inspect.getdoc(value) or "")[0]
         package = home or ".".join(getattr(value, "__module__", "").split(".")[:2])
         link = f"({name}.md)" if inspect.ismodule(value) else f"[{package}.{name}]"
         rows.append(f"| [`{name}`]{link} | {' '.join(sentence.split())} |")
