@@ -27,7 +27,7 @@ from splatjax.scattering import (
 )
 
 from ._fit import fit_gaussians, fit_weights
-from ._search import GivenVariances, VariancesPerChannel
+from ._search import VariancesPerChannel
 from ._weights import FixedTotalReflectance, NonNegativeWeights, NormalEquations, invert
 
 _TOLERANCE = 1e-7
@@ -141,7 +141,6 @@ def fit_medium(
     beam_variance: float = 0.0,
     model: Callable[[Medium], AbstractProfile] = Dipole,
     count: int = 6,
-    gaussians_start: GivenVariances | None = None,
     throw: bool = True,
 ) -> MediumFit:
     r"""Fit absorption and scattering to a measured profile: weighted least squares on its samples.
@@ -158,7 +157,6 @@ def fit_medium(
     - `beam_variance`: of the beam that made the dot, per axis, mm^2.
     - `model`: from a medium to its profile.
     - `count`: number of Gaussians.
-    - `gaussians_start`: start of the fits of Gaussians, as for `fit_gaussians`.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.
 
     **Returns:** a `MediumFit`.
@@ -179,21 +177,19 @@ def fit_medium(
         as_floats(beam_variance, measured.values.dtype),
         model,
         count,
-        gaussians_start,
     )
     failed = fitted.result != optx.RESULTS.successful
     return fitted.result.error_if(fitted, failed) if throw else fitted
 
 
 @eqx.filter_jit
-def _fit_compiled(measured, start, beam_variance, model, count, gaussians_start) -> MediumFit:
+def _fit_compiled(measured, start, beam_variance, model, count) -> MediumFit:
     def fit_channel(values, deviation, sigma_a, sigma_s_prime, eta):
         def residuals(point, _):
             fitted = fit_gaussians(
                 model(Medium(*jnp.exp(point), eta)),
                 count,
                 spread=VariancesPerChannel(),
-                start=gaussians_start,
                 throw=False,
             )
             gaussians = jax.tree.map(lambda leaf: leaf[0], fitted.gaussians)

@@ -245,8 +245,7 @@ def moment_outside(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
 
 def _denser_over_rarer(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
     """Return the index of the denser over the rarer side; at 1 the derivative is from above."""
-    rarer_inside = eta < 1
-    return jnp.where(rarer_inside, 1 / jnp.where(rarer_inside, eta, jnp.ones_like(eta)), eta)
+    return jnp.where(eta < 1, 1 / eta, eta)
 
 
 def _over_reflections(ratio: Float[Array, " channels"], factor) -> Float[Array, " channels"]:

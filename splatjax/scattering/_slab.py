@@ -90,7 +90,8 @@ def slab_response(
     """
     medium = layer.medium
     depth = 1 / medium.sigma_t_prime
-    thickness = jnp.where(layer.thickness >= (1 - 1e-6) * depth, layer.thickness, jnp.nan)
+    thickness = jnp.minimum(layer.thickness, _ENDLESS * depth)
+    thickness = jnp.where(thickness >= (1 - 1e-6) * depth, thickness, jnp.nan)
     above, below = (
         2 / 3 * fresnel.boundary(medium.eta / eta) * depth for eta in (eta_above, eta_below)
     )
@@ -113,6 +114,7 @@ def slab_response(
 
 
 _SMALL = 0.05**2  # of (s H)^2: below, a series in it leaves 1e-16
+_ENDLESS = 1e12  # mean free paths of a layer of infinite thickness
 
 
 def hyperbolic_ratio(
@@ -125,27 +127,18 @@ def hyperbolic_ratio(
     r"""Compute `sinh(s a) cosh(s b) / sinh(s height)` with `s = sqrt(u)`, where `height = a + b +
     fall` and nothing is negative.
 
-    An even function of s, hence smooth in u for a finite height: a series about `u = 0` keeps its
-    derivatives. `a` and `height` may be infinite together; then it is `exp(-s fall) (1 + exp(-2 s
-    b)) / 2`. So may `fall` and `height`; then it is 0.
+    An even function of s, hence smooth in u: a series about `u = 0` keeps its derivatives.
     """
-    finite = ~jnp.isinf(height)  # NaN must stay
-    reach = jnp.where(finite, height, 1.0)
-    small = finite & (u * reach * reach < _SMALL)
-    width = jnp.where(finite, a, 1.0)
+    small = u * height * height < _SMALL
     # Near 0, as a sum of logarithms of sinh(x) / x and of cosh(x).
     v = jnp.where(small, u, 0.0)
     y = v * b * b
     log_cosh = y * (1 / 2 - y * (1 / 12 - y * (1 / 45 - y * (17 / 2520))))
-    log_sinhs = _log_sinhc(v * width * width) - _log_sinhc(v * reach * reach)
-    series = width / reach * jnp.exp(log_sinhs + log_cosh)
-    s = jnp.sqrt(jnp.where(small, 1 / (reach * reach), u))
-    upper = jnp.where(finite, -jnp.expm1(-2 * s * width), 1.0)
-    lower = jnp.where(finite, -jnp.expm1(-2 * s * reach), 1.0)
-    endless = jnp.isinf(fall)
-    fallen = jnp.where(endless, 0.0, jnp.exp(-s * jnp.where(endless, 0.0, fall)))
-    direct = 0.5 * (1 + jnp.exp(-2 * s * b)) * fallen * upper / lower
-    return jnp.where(small, series, direct)
+    log_sinhs = _log_sinhc(v * a * a) - _log_sinhc(v * height * height)
+    series = a / height * jnp.exp(log_sinhs + log_cosh)
+    s = jnp.sqrt(jnp.where(small, 1 / (height * height), u))
+    sinhs = jnp.exp(-s * fall) * jnp.expm1(-2 * s * a) / jnp.expm1(-2 * s * height)
+    return jnp.where(small, series, 0.5 * (1 + jnp.exp(-2 * s * b)) * sinhs)
 
 
 def _log_sinhc(y):

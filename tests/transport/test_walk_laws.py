@@ -234,9 +234,7 @@ def test_a_half_space_knows_albedo_alone(float32):
     absorbed.
     """
     by_both, by_absorption, by_scattering = (
-        derivatives(
-            lambda more, a=a, s=s: [layer(0.2 + a * more, 1.0 + s * more, 1.3)], 400_000, 1.0
-        )
+        derivatives(lambda more, a=a, s=s: [layer(0.2 + a * more, 1.0 + s * more, 1.3)], 400_000)
         for a, s in ((0.2, 1.0), (1.0, 0.0), (0.0, 1.0))
     )
     along = by_both["total_reflectance"]
