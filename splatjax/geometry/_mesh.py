@@ -176,23 +176,28 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
     """
     y = mesh.corners()[..., 1] - height
     is_above = y >= 0
-    whole = np.flatnonzero(is_above.all(axis=1))
-    faces, shares = [whole], [np.broadcast_to(np.eye(3), (len(whole), 3, 3))]
-    for tip_above in (True, False):  # the tip of a triangle is kept, or the two triangles below it
-        chosen = np.flatnonzero(is_above.sum(axis=1) == (1 if tip_above else 2))
-        turn = ((is_above[chosen] == tip_above).argmax(axis=1)[:, None] + np.arange(3)) % 3
-        tip, one, other = np.moveaxis(np.eye(3)[turn], 1, 0)
-        # Symmetric in the ends of an edge, so that neighbors cut the edge between them alike.
-        off_tip, *off_ends = np.abs(np.take_along_axis(y[chosen], turn, axis=1)).T[..., None]
-        first, second = (
-            (off_end * tip + off_tip * end) / (off_end + off_tip)
-            for end, off_end in zip((one, other), off_ends, strict=True)
-        )
-        halves = [(first, one, other), (first, other, second)]
-        for triangle in [(tip, first, second)] if tip_above else halves:
-            faces.append(chosen)
-            shares.append(np.stack(triangle, axis=1))
-    cut, share = mesh.select(np.concatenate(faces)), np.concatenate(shares)
+    count = is_above.sum(axis=1)
+    whole, split = np.flatnonzero(count == 3), np.flatnonzero((count == 1) | (count == 2))
+    # The tip is the corner that is alone on its side of the plane.
+    tip_above = count[split] == 1
+    is_tip = is_above[split] == tip_above[:, None]
+    turn = (is_tip.argmax(axis=1)[:, None] + np.arange(3)) % 3
+    tip, one, other = np.moveaxis(np.eye(3)[turn], 1, 0)
+    # Symmetric in the ends of an edge, so that neighbors cut the edge between them alike.
+    off_tip, *off_ends = np.abs(np.take_along_axis(y[split], turn, axis=1)).T[..., None]
+    first, second = (
+        (off_end * tip + off_tip * end) / (off_end + off_tip)
+        for end, off_end in zip((one, other), off_ends, strict=True)
+    )
+    # What stays of a split triangle: its tip, or the two triangles below it.
+    pieces = [
+        (tip_above, (tip, first, second)),
+        (~tip_above, (first, one, other)),
+        (~tip_above, (first, other, second)),
+    ]
+    cut = mesh.select(np.concatenate([whole, *(split[stays] for stays, _ in pieces)]))
+    shares = [np.stack(corners, axis=1)[stays] for stays, corners in pieces]
+    share = np.concatenate([np.broadcast_to(np.eye(3), (len(whole), 3, 3)), *shares])
 
     def at_corners(values: Any) -> Any:
         return None if values is None else np.einsum("fkc,fci->fki", share, values)

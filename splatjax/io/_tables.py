@@ -246,12 +246,14 @@ def _number(cell: str) -> float | None:
         return None
 
 
+_OBSERVER = "CIE 1931 2 Degree Standard Observer"
+
+
 def spectrum_to_rgb(
-    wavelengths: Numbers,
-    illuminant: str = "D65",
-    observer: str = "CIE 1931 2 Degree Standard Observer",
+    wavelengths: Numbers, illuminant: str = "D65"
 ) -> Float[np.ndarray, "wavelengths rgb"]:
-    r"""Compute the matrix from a spectrum to linear sRGB: `spectrum @ matrix`.
+    r"""Compute the matrix from a spectrum to linear sRGB: `spectrum @ matrix`, for the standard
+    observer of CIE 1931.
 
     The spectrum is linear between the wavelengths and constant beyond them. A surface that reflects
     all light has the color (1, 1, 1) under every illuminant; the color of the light is a property
@@ -260,8 +262,8 @@ def spectrum_to_rgb(
     **Arguments:**
 
     - `wavelengths`: nm, ascending.
-    - `illuminant`, `observer`: by their names in colour-science (`colour.SDS_ILLUMINANTS`,
-      `colour.MSDS_CMFS`): "D65", "A", "FL11", ...
+    - `illuminant`: by its name in colour-science (`colour.SDS_ILLUMINANTS`): "D65", "A", "FL11",
+      ...
 
     **Returns:** one row for each wavelength; the sum of each column is 1.
 
@@ -271,13 +273,12 @@ def spectrum_to_rgb(
 
     known = np.asarray(wavelengths, np.float64)
     check_values("the steps of wavelengths", np.diff(known), "positive (nm)", lambda x: x > 0)
-    tables = {"illuminant": colour.SDS_ILLUMINANTS, "observer": colour.MSDS_CMFS}
-    for name, given in (("illuminant", illuminant), ("observer", observer)):
-        if given not in tables[name]:
-            raise ValueError(f"{name} {given!r} is unknown; {nearest(given, tables[name])}")
+    lights, observer = colour.SDS_ILLUMINANTS, colour.MSDS_CMFS[_OBSERVER]
+    if illuminant not in lights:
+        raise ValueError(f"illuminant {illuminant!r} is unknown; {nearest(illuminant, lights)}")
     shape = colour.SpectralShape(380, 780, 1)
-    light = tables["illuminant"][illuminant].copy().align(shape).values
-    seen = tables["observer"][observer].copy().align(shape).values
+    light = lights[illuminant].copy().align(shape).values
+    seen = observer.copy().align(shape).values
     hats = [np.interp(shape.wavelengths, known, hat) for hat in np.eye(len(known))]
     xyz = np.asarray(hats) @ (light[:, None] * seen)
     rgb = xyz @ colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB.T
