@@ -2,12 +2,14 @@
 animation, which resume after an interruption.
 """
 
+import functools
 import math
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
@@ -15,6 +17,7 @@ import tyro
 
 import splatjax as sj
 
+from ._scene import SCENE_FILES, camera_of, check_alone
 from ._terminal import check_folder, check_options, check_output, complete, preview, stage
 from ._view import ViewOptions, draw
 
@@ -28,7 +31,10 @@ Rendered = tuple[sj.Frame, sj.Material, tuple[sj.scene.AbstractLight, ...], sj.C
 
 @dataclass(frozen=True, kw_only=True)
 class Render(ViewOptions):
-    """Render splats, or the built-in bust: an EXR file with every layer, and a PNG file beside it.
+    """Render splats, the built-in bust, or a scene: an EXR file with every layer, and a PNG file.
+
+    A scene is a TOML file of body, material, lights and camera, or a picture of this command, which
+    is rendered again.
 
     The light is a studio, an --environment, or a single light with a weak fill. The camera looks at
     the middle of the splats from a distance at which all of them are visible. Angles are in
@@ -48,6 +54,19 @@ class Render(ViewOptions):
     #: Number of splats to read at a time, for files that are larger than memory. 0 reads all at
     #: once.
     stream: int = 0
+    camera_file: Annotated[
+        str | None,
+        tyro.conf.arg(
+            name="camera",
+            metavar="FILE[:NAME]",
+            help="Camera from transforms.json, glTF, or a folder of COLMAP, instead of --azimuth, "
+            "--elevation and --fov; of several, by its name or its number from 0. The width of "
+            "the picture follows from its --height.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    #: Length of the unit of --camera, mm.
+    camera_unit: float = 1.0
 
     def run(self) -> None:
         check_output(self.output, (".exr",))
@@ -64,11 +83,36 @@ class Render(ViewOptions):
                     "diffusion": (self.diffusion == "clusters", "be clusters with --stream"),
                 },
             )
-        rendered = self._streamed(self.splats) if self.splats and self.stream else self._at_once()
-        self.note_unresolved_layers(*rendered[:2])
+        options = self
+        if self._scene:
+            check_alone(self)
+            diffusion = self._scene.entries["settings"].get("diffusion", "clusters")
+            options, rendered = replace(self, diffusion=diffusion), self._of_scene(self._scene.path)
+        elif self.splats and self.stream:
+            rendered = self._streamed(self.splats)
+        else:
+            rendered = self._at_once()
+        options.note_unresolved_layers(*rendered[:2])
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
-            written = self.write(self.output, *rendered)
+            written = options.write(self.output, *rendered)
         print(*written, sep="\n")
+
+    @functools.cached_property
+    def _scene(self) -> Any:
+        is_scene = self.splats and self.splats.suffix.lower() in SCENE_FILES
+        return sj.io.scene_table(self.splats) if is_scene else None
+
+    def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
+        if self.camera_file is None:
+            return super().camera(parts, azimuth)
+        return camera_of(self.camera_file, self.camera_unit, self.up, self.height, self.scale)
+
+    def record(self, folder: Path, *scene: Any) -> dict[str, Any]:
+        if not self._scene:
+            return super().record(folder, *scene)
+        moved = os.path.relpath(self._scene.folder, folder)
+        versions = {"splatjax": sj.__version__, "jax": jax.__version__}
+        return versions | {"folder": moved, "scene": self._scene.entries}
 
     def _at_once(self) -> Rendered:
         splats, material = self.load()
@@ -76,11 +120,21 @@ class Render(ViewOptions):
         scene = sj.Scene(
             splats, self.lights(material, self.azimuth, self.single_light[0]), material
         )
+        return self._drawn(scene, camera, self.settings)
+
+    def _of_scene(self, path: Path) -> Rendered:
+        with stage(f"loading {path}"):
+            scene, camera, settings = sj.io.load_scene(path)
+        return self._drawn(scene, camera, settings)
+
+    def _drawn(self, scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings) -> Rendered:
         with preview(lambda side: rough_picture(scene, camera, self.exposure, side)):
             with stage("planning"):
-                plan = sj.make_plan(scene, camera, self.settings)
-            with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
-                return draw(scene, camera, self.settings, plan), material, scene.lights, camera
+                plan = sj.make_plan(scene, camera, settings)
+            size = f"{camera.width} x {camera.height}"
+            with stage(f"rendering {scene.splats.count} splats at {size}"):
+                frame = draw(scene, camera, settings, plan)
+        return frame, scene.material, scene.lights, camera
 
     def _streamed(self, path: Path) -> Rendered:
         file = sj.SplatFile(path, self.stream, up=self.up)

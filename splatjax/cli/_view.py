@@ -15,17 +15,14 @@ import splatjax as sj
 from splatjax._memory import check_memory
 from splatjax.render import BYTES_PER_PIXEL, BYTES_PER_SPLAT, check_displayable
 
+from ._scene import scene_record
 from ._terminal import OptionalFloat, Rules, UpAxis, check_options, note, option_name, stage
 
 # Degrees: the fill is beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
 _SINGLE_LIGHT = -20.0, 30.0, 0.1  # azimuth, elevation, and strength of the fill
-ENVIRONMENTS = {
-    "studio": sj.scene.studio,
-    "overcast": sj.scene.overcast_sky,
-    "sun": sj.scene.sun_and_sky,
-}
-_NOT_IN_PICTURES = ("splats", "output", "fps", "quiet")
+ENVIRONMENTS = sj.io.ENVIRONMENTS
+_NOT_IN_PICTURES = ("splats", "output", "fps", "quiet", "half", "camera_file", "camera_unit")
 _note_once = functools.cache(note)
 
 
@@ -254,8 +251,8 @@ class ViewOptions:
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
         picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
         solved = self.diffusion == "shape"  # whose one layer is of no Gaussian
-        variances = None if solved else material.gaussians.variances.tolist()
-        record = {"variances": variances, "manifest": self.manifest()}
+        record: dict[str, Any] = {"manifest": self.record(path.parent, material, lights, camera)}
+        record["variances"] = None if solved else material.gaussians.variances.tolist()
         sj.write_exr(path, frame, **record, camera=camera, half=self.half)
         if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
             shown = np.asarray(lights[0].behind(frame, camera))
@@ -263,6 +260,10 @@ class ViewOptions:
             shown = np.concatenate([shown, np.asarray(frame.coverage)[..., None]], axis=-1)
         sj.write_png(picture, shown, exposure=self.exposure)
         return path, picture
+
+    def record(self, folder: Path, *scene: Any) -> dict[str, Any]:
+        """Return the manifest of a picture in a folder, for its material, lights and camera."""
+        return self.manifest() | {"scene": scene_record(self, folder, *scene)}
 
     def manifest(self) -> dict[str, Any]:
         """Return everything on which the pictures depend: options by name, contents of their files,

@@ -8,16 +8,14 @@ from ._files import (
     save_exports as save_exports,
     write_record as write_record,
 )
-from ._frames import (
-    read_exr as read_exr,
-    read_manifest as read_manifest,
-    write_exr as write_exr,
-)
 from ._images import (
     linear_to_srgb as linear_to_srgb,
+    read_exr as read_exr,
+    read_manifest as read_manifest,
     read_picture as read_picture,
     srgb_to_linear as srgb_to_linear,
     write_animation as write_animation,
+    write_exr as write_exr,
     write_png as write_png,
 )
 from ._materials import (
@@ -39,13 +37,25 @@ from ._tables import (
     spectrum_to_rgb as spectrum_to_rgb,
     write_columns as write_columns,
 )
-from ._cameras import load_cameras as load_cameras
+from ._cameras import (
+    load_camera as load_camera,
+    load_cameras as load_cameras,
+    resized as resized,
+)
 from ._meshes import read_textured_mesh as read_textured_mesh, sample_mesh as sample_mesh
 from ._lights import (
+    ENVIRONMENTS as ENVIRONMENTS,
     load_environment as load_environment,
     load_lights as load_lights,
+    plain_light as plain_light,
     picture_paths as picture_paths,
     read_observations as read_observations,
+)
+from ._scenes import (
+    load_scene as load_scene,
+    plain_scene as plain_scene,
+    scene_table as scene_table,
+    save_scene as save_scene,
 )
 from ._ply import (
     SplatFile as SplatFile,

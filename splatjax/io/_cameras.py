@@ -1,10 +1,9 @@
-"""Cameras of files: transforms.json of NeRF and instant-ngp, COLMAP, glTF, and OpenEXR."""
+"""Cameras of files: transforms.json of NeRF and instant-ngp, COLMAP, and glTF."""
 
 import json
-import struct
 import warnings
 from collections.abc import Iterator, Mapping
-from io import BytesIO
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -14,15 +13,16 @@ from jaxtyping import Float
 from splatjax.scene import Camera
 
 from ._files import StrPath, check_units, existing_file, with_y_up
-from ._images import read_planes
 from ._trimesh import one_sentence
 
 _Pose: TypeAlias = Float[np.ndarray, "4 4"]
 _Found: TypeAlias = Iterator[tuple[str, Mapping[str, Any], _Pose]]
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
 _SQUARE = 1e-2  # pixels, at the edge of a picture, by which focal lengths may differ
+_ROWS = 512  # of a picture, whose size glTF does not specify
+_LIGHTS = "KHR_lights_punctual"
 _SHEAR = 1e-3  # relative difference of the scales of axes
-# Models of COLMAP in the order of their numbers, with their parameters; others have distortion.
+# Models of COLMAP with their parameters; others have distortion.
 _MODELS = {
     "SIMPLE_PINHOLE": ("fl_x", "cx", "cy"),
     "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
@@ -30,8 +30,6 @@ _MODELS = {
     "RADIAL": ("fl_x", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
-_ROWS = 512  # of a picture, whose size glTF does not specify
-_LIGHTS = "KHR_lights_punctual"
 
 
 def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[str, Camera]:
@@ -40,9 +38,8 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
     | file | cameras |
     | --- | --- |
     | `transforms.json` | of NeRF, instant-ngp and nerfstudio, by `file_path` |
-    | a folder with `cameras` and `images` | of COLMAP, `.txt` or `.bin`, by the names of images |
+    | a folder of COLMAP | `cameras.txt` and `images.txt`, by the names of images |
     | `.gltf`, `.glb` | perspective cameras, by the names of their nodes; 512 rows |
-    | `.exr` | the camera of a picture: `worldToCamera` and `worldToNDC` |
 
     **Arguments:**
 
@@ -57,10 +54,10 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
     """
     path, cameras = Path(path), {}
     check_units(path, mm_per_unit, up)
-    readers = {".json": _transforms, ".gltf": _gltf, ".glb": _gltf, ".exr": _picture}
+    readers = {".json": _transforms, ".gltf": _gltf, ".glb": _gltf}
     reader = _colmap if path.is_dir() else readers.get(existing_file(path).suffix.lower())
     if reader is None:
-        known = "transforms.json, glTF, OpenEXR, or a folder of COLMAP"
+        known = "transforms.json, glTF, or a folder of COLMAP"
         raise ValueError(f"{path}: is not a file of cameras; give {known}")
     with one_sentence(path):
         for name, lens, pose in reader(path):
@@ -69,6 +66,25 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
     if not cameras:
         raise ValueError(f"{path}: has no perspective camera; export it with its cameras")
     return cameras
+
+
+def load_camera(path: StrPath, name: str = "0", *, mm_per_unit: float, up: str = "y") -> Camera:
+    """Read one of the cameras of a file (`load_cameras`), by its name or its number from 0."""
+    cameras = load_cameras(path, mm_per_unit=mm_per_unit, up=up)
+    names = {str(number): each for number, each in enumerate(cameras)} | {n: n for n in cameras}
+    if name not in names:
+        some = ", ".join([*cameras][:3])
+        raise ValueError(
+            f"{path}: has no camera {name!r}; give one of its {len(cameras)} names ({some}, ...), "
+            "or a number from 0"
+        )
+    return cameras[names[name]]
+
+
+def resized(camera: Camera, height: int) -> Camera:
+    """Return a camera of another number of rows, and of as many columns as it then needs."""
+    width = round(camera.width * height / camera.height)
+    return replace(camera, width=width, height=height)
 
 
 def _camera(
@@ -119,68 +135,40 @@ def _transforms(path: Path) -> _Found:
 def _colmap(path: Path) -> _Found:
     from trimesh.transformations import quaternion_matrix  # takes a second
 
-    is_text = (path / "images.txt").exists()
-    cameras, images = (_text_rows if is_text else _binary_rows)(path)
-    lenses = {
-        int(number): {"camera_model": model, "w": width, "h": height}
-        | dict(zip(_MODELS.get(model, ()), map(float, values), strict=False))
-        for number, model, width, height, *values in cameras
-    }
-    for _, *numbers, camera, name in images:
-        to_camera = quaternion_matrix([*map(float, numbers[:4])])
-        to_camera[:3, 3] = numbers[4:]
-        yield name.strip(), lenses[int(camera)], np.linalg.inv(to_camera)
+    if (path / "images.bin").exists() and not (path / "images.txt").exists():
+        convert = "convert it by `colmap model_converter --output_type TXT`"
+        raise ValueError(f"{path}: is a binary model; {convert}")
+    lenses = {}
+    for line in _lines(path / "cameras.txt"):
+        number, model, width, height, *values = line.split()
+        known = zip(_MODELS.get(model, ()), map(float, values), strict=False)
+        lenses[number] = {"camera_model": model, "w": width, "h": height, **dict(known)}
+    for line in _lines(path / "images.txt")[::2]:  # between them, the points of each
+        _, *pose, camera, name = line.split(maxsplit=9)
+        to_camera = quaternion_matrix([*map(float, pose[:4])])
+        to_camera[:3, 3] = pose[4:]
+        yield name, lenses[camera], np.linalg.inv(to_camera)
 
 
-def _text_rows(path: Path) -> Iterator[list[list]]:
-    for name, step, columns in (("cameras", 1, -1), ("images", 2, 9)):  # a line of points follows
-        text = existing_file(path / f"{name}.txt").read_text(encoding="utf-8")
-        lines = [line for line in text.split("\n") if not line.startswith("#")]
-        yield [line.split(maxsplit=columns) for line in lines[::step] if line.strip()]
+def _lines(path: Path) -> list[str]:
+    lines = existing_file(path).read_text(encoding="utf-8").rstrip().split("\n")
+    return [line for line in lines if not line.startswith("#")]
 
 
-def _binary_rows(path: Path) -> Iterator[list[list]]:
-    def unpack(layout: str) -> tuple:
-        return struct.unpack(f"<{layout}", file.read(struct.calcsize(f"<{layout}")))
-
-    rows, models = [], [*_MODELS]
-    with open(existing_file(path / "cameras.bin"), "rb") as file:
-        for _ in range(*unpack("Q")):
-            number, model, *size = unpack("iiQQ")
-            if model not in range(len(models)):
-                raise ValueError(f"{path}: camera model {model} has distortion; undistort first")
-            rows.append([number, models[model], *size, *unpack(f"{len(_MODELS[models[model]])}d")])
-    yield rows
-    rows = []
-    with BytesIO(data := existing_file(path / "images.bin").read_bytes()) as file:
-        for _ in range(*unpack("Q")):
-            pose = unpack("i7di")
-            name = file.read(data.index(b"\0", file.tell()) - file.tell()).decode()
-            _, points = unpack("cQ")
-            file.seek(24 * points, 1)
-            rows.append([*pose, name])
-    yield rows
-
-
-def _picture(path: Path) -> _Found:
-    planes, header, _ = read_planes(path)
-    names = "worldToCamera", "worldToNDC"
-    if not header.keys() >= set(names):
-        raise ValueError(f"{path}: has no {' and '.join(names)}; write it with its camera")
-    # Of row vectors: right, up and forward; and columns and rows over the size of the picture.
-    to_camera, to_picture = (np.reshape(header[name], (4, 4)).astype(float) for name in names)
-    shown = np.linalg.inv(to_camera) @ to_picture
-    height, width = next(iter(planes.values())).shape
-    (focal_x, focal_y), (x, y) = np.stack([shown[[0, 1], [0, 1]], shown[2, :2]]) / shown[2, 3]
-    lens = {"w": width, "h": height, "fl_x": focal_x * width, "fl_y": -focal_y * height}
-    pose = np.linalg.inv(np.diag([1, -1, 1, 1]) @ to_camera.T)
-    yield path.name, lens | {"cx": x * width, "cy": y * height}, pose
+def _gltf(path: Path) -> _Found:
+    for name, camera, matrix in gltf_nodes(path, "camera"):
+        if camera["type"] == "perspective":
+            lens = camera["perspective"]
+            focal, width = 0.5 * _ROWS / np.tan(0.5 * lens["yfov"]), lens.get("aspectRatio", 1.0)
+            size = {"w": round(_ROWS * width), "h": _ROWS}
+            yield name, {"fl_x": focal, **size}, matrix * [1, -1, -1, 1]
+        else:
+            left_out = f"the camera {name!r} is {camera['type']}, and is left out"
+            warnings.warn(f"{path}: {left_out}", stacklevel=2)
 
 
 def gltf_nodes(path: Path, kind: str) -> _Found:
-    """Yield name, contents and transformation to the world of all nodes with a camera or light,
-    which trimesh leaves out.
-    """
+    """Yield name, contents and transformation to the world of all nodes with a camera or light."""
     from trimesh.transformations import quaternion_matrix, translation_matrix  # takes a second
 
     data = path.read_bytes()
@@ -206,16 +194,16 @@ def gltf_nodes(path: Path, kind: str) -> _Found:
         yield from place(root, np.eye(4))
 
 
-def _gltf(path: Path) -> _Found:
-    """Yield name, lens and pose (camera to world; right, down and forward) of perspective cameras.
-    Others are left out with a warning.
-    """
-    for name, camera, matrix in gltf_nodes(path, "camera"):
-        if camera["type"] == "perspective":
-            lens = camera["perspective"]
-            focal, width = 0.5 * _ROWS / np.tan(0.5 * lens["yfov"]), lens.get("aspectRatio", 1.0)
-            size = {"w": round(_ROWS * width), "h": _ROWS}
-            yield name, {"fl_x": focal, **size}, matrix * [1, -1, -1, 1]
-        else:
-            left_out = f"the camera {name!r} is {camera['type']}, and is left out"
-            warnings.warn(f"{path}: {left_out}", stacklevel=2)
+def camera_matrices(camera: Camera) -> dict[str, np.ndarray]:
+    """Return the matrices of a camera for row vectors, as RenderMan defines them."""
+    rotation, position = np.asarray(camera.rotation, float), np.asarray(camera.position, float)
+    to_camera = np.eye(4)
+    to_camera[:3, :3] = rotation.T * [1, -1, 1]
+    to_camera[3, :3] = -position @ to_camera[:3, :3]
+    size = np.asarray([camera.width, camera.height])
+    focal = float(camera.focal_length) * camera.height / size
+    to_picture = np.diag([*focal * [1, -1], 1.0, 0.0])
+    to_picture[2, :2] = np.asarray(camera.principal_pixel, float) / size
+    to_picture[2:, 2:] = [[1, 1], [-camera.near, 0]]  # depth from 0 at the near plane to 1
+    matrices = {"worldToCamera": to_camera, "worldToNDC": to_camera @ to_picture}
+    return {name: matrix.astype(np.float32) for name, matrix in matrices.items()}

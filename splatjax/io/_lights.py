@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Array
 
 from splatjax._records import check_values
+from splatjax.exports import plain_numbers
 from splatjax.inverse import KnownIntensity, Observation, UnknownColor, UnknownIntensity
 from splatjax.scene import (
     AbstractLight,
@@ -20,6 +22,9 @@ from splatjax.scene import (
     PointLight,
     RectangleLight,
     SphereLight,
+    overcast_sky,
+    studio,
+    sun_and_sky,
 )
 
 from ._cameras import gltf_nodes
@@ -28,17 +33,22 @@ from ._images import read_picture
 from ._tables import Table, read_toml
 from ._trimesh import one_sentence
 
+PLACE = ("position", "target", "up", "fov")
 _MOST_ROWS = 512  # of an environment
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
+ENVIRONMENTS = {"studio": studio, "overcast": overcast_sky, "sun": sun_and_sky}
+# Entries that may be missing.
+_OPTIONAL = ("rotation", "strength", "up", "directions", "count", "cast_shadows")
 _LIGHTS = {
     "directional": (DirectionalLight, ("direction", "irradiance", "cast_shadows")),
     "point": (PointLight, ("position", "intensity", "cast_shadows")),
     "beam": (GaussianBeam, ("origin", "direction", "power", "variance")),
-    "rectangle": (RectangleLight, ("center", "radiance", "edges", "cast_shadows")),
-    "disk": (DiskLight, ("center", "radiance", "direction", "radius", "cast_shadows")),
-    "sphere": (SphereLight, ("center", "radiance", "radius", "cast_shadows")),
+    "rectangle": (RectangleLight, ("center", "radiance", "edges", "count", "cast_shadows")),
+    "disk": (DiskLight, ("center", "radiance", "direction", "radius", "count", "cast_shadows")),
+    "sphere": (SphereLight, ("center", "radiance", "radius", "count", "cast_shadows")),
+    "environment": (EnvironmentLight, ("image", *_OPTIONAL)),
 }
-_LIGHT_ENTRIES = {"kind"}.union(*(names for _, names in _LIGHTS.values()))
+LIGHT_ENTRIES = {"kind"}.union(*(names for _, names in _LIGHTS.values()))
 
 
 def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
@@ -142,41 +152,66 @@ def _observation(table: Table) -> Observation:
         known &= True if mask is None or mask.shape != known.shape else mask
         size = np.sqrt(np.mean(np.square(picture[known]))) if known.any() else 0.0
         deviation = noise * (size or 1.0)
-    camera = table.table("camera", ("position", "target", "up", "fov"))
-    vectors = [camera.numbers(name).tolist() for name in ("position", "target")]
-    up = camera.numbers("up").tolist() if "up" in camera.entries else None
     height, width, channels = picture.shape
     return table.make(
         Observation,
         picture,
-        camera.make(
-            Camera.look_at,
-            *vectors,
-            up=up,
-            fov=camera.number("fov", 25.0),
-            width=width,
-            height=height,
-        ),
-        tuple(_light(each, channels) for each in table.tables("lights", _LIGHT_ENTRIES)),
+        look_at(table.table("camera", PLACE), width, height),
+        tuple(light_of(each, channels) for each in table.tables("lights", LIGHT_ENTRIES)),
         mask,
         deviation,
         _INTENSITIES[table.one_of("intensity", _INTENSITIES, "known")](),
     )
 
 
+def look_at(table: Table, width: int, height: int) -> Camera:
+    """Make the camera of a table of its place."""
+    vectors = [table.numbers(name).tolist() for name in ("position", "target")]
+    up = table.numbers("up").tolist() if "up" in table.entries else None
+    size = {"width": width, "height": height}
+    return table.make(Camera.look_at, *vectors, up=up, fov=table.number("fov", 25.0), **size)
+
+
+def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
+    """Return the table of a light; an environment has an image of this name.
+
+    **Raises:** `ValueError` for a light of another kind than a file can store.
+    """
+    for kind, (made, names) in _LIGHTS.items():
+        if type(light) is made:
+            values = {name: getattr(light, name) for name in names if name != "image"}
+            plain = {n: plain_numbers(value) for n, value in values.items() if value is not None}
+            return {"kind": kind} | ({"image": image} if "image" in names else {}) | plain
+    raise ValueError(
+        f"a file cannot store a {type(light).__name__}; give lights of kinds {', '.join(_LIGHTS)}"
+    )
+
+
+def _environment_image(table: Table) -> Array:
+    name = table.text("image")
+    if name in ENVIRONMENTS:
+        return ENVIRONMENTS[name]()
+    return table.make(load_environment, table.folder / name).image
+
+
 def _picture(table: Table, name: str) -> np.ndarray:
-    file = table.entries.get(name)
-    if not isinstance(file, str):
-        raise ValueError(f"{table.where} {name} must be the name of an EXR file; it is {file!r}")
     with naming(f"{table.where} {name}"):
-        return read_picture(table.path.parent / file)
+        return read_picture(table.folder / table.text(name))
 
 
-def _light(table: Table, channels: int) -> AbstractLight:
-    light, names = _LIGHTS[table.one_of("kind", _LIGHTS)]
-    table = Table(table.path, table.name, table.entries, ("kind", *names))
-    values: dict[str, Any] = {name: table.numbers(name) for name in names if name != "cast_shadows"}
-    strength = values[light.strength_field]
+def light_of(table: Table, channels: int) -> AbstractLight:
+    """Make the light of a table, in the channels of a picture."""
+    kind = table.one_of("kind", _LIGHTS)
+    light, names = _LIGHTS[kind]
+    table = Table(table.path, table.name, table.entries, ("kind", *names), table.folder)
+    given = [name for name in names if name in table.entries or name not in _OPTIONAL]
+    others = {"image", "count", "cast_shadows"}
+    values: dict[str, Any] = {name: table.numbers(name) for name in given if name not in others}
+    if "count" in given:
+        values["count"] = int(table.number("count"))
+    if kind == "environment":
+        values["image"] = _environment_image(table)
+    strength = values.get(light.strength_field, np.ones(1))
     table.make(check_values, light.strength_field, strength, "at least 0", lambda x: x >= 0)
     if strength.size not in (1, channels):
         raise ValueError(

@@ -1,13 +1,11 @@
 """Materials as TOML files: optical coefficients, their source, and the Gaussians fitted to them."""
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import tomli_w
 from jaxtyping import Array
 
 from splatjax._library import profiles_folder as profiles_folder
@@ -28,7 +26,7 @@ from splatjax.scattering import (
 )
 from splatjax.scene import Material
 
-from ._files import StrPath, atomic_path, naming
+from ._files import StrPath, naming
 from ._media import (
     LAYER_ENTRIES,
     MEDIUM_ENTRIES,
@@ -42,11 +40,11 @@ from ._media import (
     plain_skin,
     skin_of,
 )
-from ._tables import Table, nearest, read_toml
+from ._tables import Table, nearest, read_toml, write_toml
 
 VARIANCE_UNIT = "mm^2"
 _KINDS = {"medium": "[medium]", "openpbr": "[openpbr]", "layers": "[[layers]]", "skin": "[skin]"}
-_TABLES = (*_KINDS, "surface", "single_scattering", "angles", "source", "fit")
+MATERIAL_TABLES = (*_KINDS, "surface", "single_scattering", "angles", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
 # Names in [fit] of profiles whose coefficients are in the file.
 _MODELS: dict[type, str] = {
@@ -90,7 +88,12 @@ def load_material(name_or_path: StrPath) -> Material:
     **Raises:** `ValueError` for an unknown name, and for a file that is not a material, with the
     fault and the remedy.
     """
-    tables, profile = _read(name_or_path)
+    return read_material(_tables(name_or_path))
+
+
+def read_material(tables: Table) -> Material:
+    """Read a material from its tables: `load_material`."""
+    profile = _profile(tables)
     if "fit" not in tables.entries:
         path, fitted = tables.path, tables.path.with_name(f"{tables.path.stem}_fitted.toml")
         raise ValueError(
@@ -119,14 +122,12 @@ def load_material(name_or_path: StrPath) -> Material:
     return fit.make(Material, gaussians, **terms)
 
 
-def surface_and_source(
-    name_or_path: StrPath,
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def surface_and_source(name_or_path: StrPath) -> tuple[dict[str, Any], dict[str, Any]]:
     r"""Return the surface of a material's file, as arguments of `Material`, and its [source].
 
     **Raises:** `ValueError` as `load_material` does.
     """
-    tables, _ = _read(name_or_path)
+    _profile(tables := _tables(name_or_path))
     return _surface(tables), tables.entries.get("source", {})
 
 
@@ -142,7 +143,7 @@ def load_medium(name_or_path: StrPath) -> Medium:
     **Raises:** `ValueError` as `load_material` does, and for a material that was published without
     coefficients.
     """
-    tables, profile = _read(name_or_path)
+    profile = _profile(tables := _tables(name_or_path))
     if isinstance(profile, Dipole):
         return profile.medium
     have = "layers or pigments (`load_profile`)" if profile else "Gaussians (`load_material`)"
@@ -156,8 +157,8 @@ def load_mean_cosine(name_or_path: StrPath) -> float:
 
     **Raises:** `ValueError` as `load_material` does.
     """
-    tables, profile = _read(name_or_path)
-    if not isinstance(profile, Dipole):
+    tables = _tables(name_or_path)
+    if not isinstance(_profile(tables), Dipole):
         return 0.0
     return tables.table("medium", MEDIUM_ENTRIES).number("g", 0.0)
 
@@ -175,7 +176,7 @@ def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin:
 
     **Raises:** `ValueError` as `load_medium` does.
     """
-    return _read(name_or_path)[1] or Dipole(load_medium(name_or_path))
+    return _profile(_tables(name_or_path)) or Dipole(load_medium(name_or_path))
 
 
 def save_material(
@@ -201,6 +202,17 @@ def save_material(
 
     **Raises:** `OSError` if the file cannot be written, `ValueError` for another kind of profile.
     """
+    write_toml(path, plain_material(material, profile, source, fit, g))
+
+
+def plain_material(
+    material: Material,
+    profile: AbstractProfile | Skin | None = None,
+    source: Mapping[str, Any] | None = None,
+    fit: Mapping[str, Any] | None = None,
+    g: float = 0.0,
+) -> dict[str, Any]:
+    """Return the tables of a material's file; arguments are those of `save_material`."""
     if not isinstance(profile, Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin | None):
         raise ValueError(
             "profile must be a Dipole, BetterDipole, PhotonBeam, LayeredMultipole or Skin, "
@@ -221,7 +233,7 @@ def save_material(
         }
     if material.angles is not None:
         tables["angles"] = {"coefficients": plain_numbers(material.angles.coefficients)}
-    tables |= {
+    return tables | {
         "surface": {name: plain_numbers(getattr(material, name)) for name in _SURFACE},
         "source": dict(source or {}),
         "fit": {
@@ -235,21 +247,17 @@ def save_material(
             },
         },
     }
-    number = r"-?(?:[\d.]+(?:e[+-]?\d+)?|inf|nan)"  # arrays of numbers on one line
-    text = re.sub(
-        rf"\[\s+((?:{number},\s+)+)\]",
-        lambda rows: "[" + ", ".join(rows[1].replace(",", " ").split()) + "]",
-        tomli_w.dumps(tables),
-    )
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
-def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Skin | None]:
-    """Read and check all tables of a material, and its coefficients."""
+def _tables(name_or_path: StrPath) -> Table:
     path = material_path(name_or_path)
     entries = read_toml(path, "check the path, or give a material (`list_materials()`)")
-    tables = Table(path, "", entries, _TABLES)
+    return Table(path, "", entries, MATERIAL_TABLES)
+
+
+def _profile(tables: Table) -> Dipole | LayeredMultipole | Skin | None:
+    """Check all tables of a material, and read its coefficients."""
+    path, entries = tables.path, tables.entries
     kinds = [kind for kind in _KINDS if kind in tables.entries]
     if len(kinds) > 1 or not (kinds or "fit" in tables.entries):
         has = (
@@ -261,14 +269,14 @@ def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Ski
     if "openpbr" in kinds:
         entries["medium"] = plain_openpbr(tables.table("openpbr", OPENPBR_ENTRIES))
     if "medium" in entries:
-        return tables, Dipole(medium_of(tables.table("medium", MEDIUM_ENTRIES)))
+        return Dipole(medium_of(tables.table("medium", MEDIUM_ENTRIES)))
     if not kinds:
-        return tables, None
+        return None
     if "skin" in kinds:
-        return tables, skin_of(tables.table("skin", SKIN_ENTRIES))
+        return skin_of(tables.table("skin", SKIN_ENTRIES))
     layers = [layer_of(each) for each in tables.tables("layers", LAYER_ENTRIES)]
     with naming(f"{path}: [[layers]]"):
-        return tables, LayeredMultipole(layers)
+        return LayeredMultipole(layers)
 
 
 def _surface(tables: Table) -> dict[str, Array]:

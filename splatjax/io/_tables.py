@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tomli_w
 from jaxtyping import Array, Float
 
 from splatjax._records import Numbers, check_values
@@ -44,8 +45,11 @@ class Table:
     `known`.
     """
 
-    def __init__(self, path: Path, name: str, entries: Any, known: Iterable[str]):
+    def __init__(
+        self, path: Path, name: str, entries: Any, known: Iterable[str], folder: Path | None = None
+    ):
         self.path, self.name, self.entries = path, name, entries
+        self.folder = folder or path.parent  # of the files that it names
         self.where = f"{path}: [{name}]" if name else f"{path}:"
         if not isinstance(entries, dict):
             raise ValueError(f"{self.where} must be a table; it is {entries!r}")
@@ -56,7 +60,8 @@ class Table:
             )
 
     def table(self, name: str, known: Iterable[str]) -> "Table":
-        return Table(self.path, f"{self.name} {name}".strip(), self.entries.get(name), known)
+        inner = f"{self.name} {name}".strip()
+        return Table(self.path, inner, self.entries.get(name), known, self.folder)
 
     def tables(self, name: str, known: Iterable[str]) -> "list[Table]":
         """Return a list of tables within this one, from 1."""
@@ -64,7 +69,7 @@ class Table:
         if not isinstance(given, list) or not given:
             raise ValueError(f"{self.where} {name} must be one table or more; it is {given!r}")
         return [
-            Table(self.path, f"{self.name} {name} {number}".strip(), entries, known)
+            Table(self.path, f"{self.name} {name} {number}".strip(), entries, known, self.folder)
             for number, entries in enumerate(given, start=1)
         ]
 
@@ -98,10 +103,28 @@ class Table:
             raise ValueError(f"{self.where} {name} must be one number; it is {values.tolist()}")
         return float(values)
 
+    def text(self, name: str) -> str:
+        value = self.entries.get(name)
+        if not isinstance(value, str):
+            raise ValueError(f"{self.where} {name} must be a name in quotes; it is {value!r}")
+        return value
+
     def make(self, make: Callable[..., Made], *args: Any, **named: Any) -> Made:
         """Make a record from entries; its errors name the table."""
         with naming(self.where):
             return make(*args, **named)
+
+
+def write_toml(path: StrPath, tables: Mapping[str, Any]) -> None:
+    """Write tables, with arrays of numbers on one line, completely or not at all."""
+    number = r"-?(?:[\d.]+(?:e[+-]?\d+)?|inf|nan)"
+    text = re.sub(
+        rf"\[\s+((?:{number},\s+)+)\]",
+        lambda rows: "[" + ", ".join(rows[1].replace(",", " ").split()) + "]",
+        tomli_w.dumps(tables),
+    )
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -3,6 +3,7 @@ granted, small. Pages that teach stand for themselves.
 """
 
 import dataclasses
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,14 @@ from splatjax.cli import main
 
 _RADIUS = 1.1  # of the ball, in units of 53 mm
 _SIDE = 24  # pixels
+_TESTS = Path(__file__).parents[1]
+_TRANSFORMS = """{"w": 64, "h": 64, "fl_x": 80, "frames": [{"file_path": "images/0001.png",
+"transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 30], [0, 0, 0, 1]]}]}"""
+_SCENE = """material = "marble"
+splats = { bust = 1500 }
+camera = { position = [0, 0, 600], target = [0, 0, 0], width = 32, height = 32 }
+lights = [{ kind = "point", position = [0, 0, 600], intensity = 1e6 }]
+"""
 
 
 def _ball() -> trimesh.Trimesh:
@@ -104,6 +113,9 @@ _MADE = {
     "dot.exr": _dot,
     "left.exr": _photograph,
     "figurine.ply": _figurine,
+    "transforms.json": lambda path: path.write_text(_TRANSFORMS),
+    "stage.glb": lambda path: shutil.copy(_TESTS / "io" / "cameras" / "stage.glb", path),
+    "scene.toml": lambda path: path.write_text(_SCENE),
 }
 
 

@@ -73,12 +73,15 @@ unit = "mm^2"
 variances = [0.1, 2.0]
 weights = [[0.2], [0.3]]
 """
+CAMERAS = """{"camera_angle_x": 0.7, "w": 64, "h": 48, "cx": 30, "k1": 0, "frames": [{"file_path":
+"a.png", "transform_matrix": [[1, 0, 0, 0], [0, 0, -1, 2], [0, 1, 0, 3.5], [0, 0, 0, 1]]}]}"""
 TEXTS = {
     "material": (
         ".toml",
         [*(sj.io.material_path(n).read_text() for n in ("skin", "marble")), SINGLE],
     ),
     "observations": (".toml", [PICTURES]),
+    "cameras": (".json", [CAMERAS]),
     "profile": (".csv", ["# measured\nr, red, green\n0.1, 1, 2\n0.2, 0.5, 1e-1\n0.4, 0.1, 0.01\n"]),
     "record": (".json", ['{"--width": 16, "splats": "a.ply", "turn": null, "x": [1.5, true]}\n']),
     "obj": (".obj", [SQUARE]),
@@ -96,6 +99,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     ),
     "material": lambda path: (sj.load_profile(path), sj.load_material(path)),
     "observations": sj.io.read_observations,
+    "cameras": partial(sj.io.load_cameras, mm_per_unit=1.0),
     "profile": sj.io.read_profile,
     "record": sj.io.read_record,
 }

@@ -1,0 +1,168 @@
+"""Scenes as TOML files: splats or a mesh, material, lights, camera and settings. The manifest of a
+picture is one, too.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from splatjax.diffusion import ClusterDiffuser, ShapeDiffuser
+from splatjax.exports import plain_numbers
+from splatjax.geometry import bust
+from splatjax.render import RenderSettings
+from splatjax.scene import Camera, EnvironmentLight, Material, Scene, Splats
+
+from ._cameras import load_camera, resized
+from ._files import StrPath, atomic_path
+from ._images import read_manifest
+from ._lights import LIGHT_ENTRIES, PLACE, light_of, look_at, plain_light
+from ._materials import MATERIAL_TABLES, load_material, plain_material, read_material
+from ._meshes import sample_mesh
+from ._ply import read_splats, write_splats
+from ._tables import Table, read_toml, write_toml
+
+DIFFUSERS = {"clusters": ClusterDiffuser(), "shape": ShapeDiffuser()}
+_TABLES = ("material", "splats", "camera", "lights", "settings")
+_BODY = ("file", "mesh", "bust", "count", "mm_per_unit", "up", "scale", "albedo")
+_SIZE, _POSE = ("width", "height"), ("position", "rotation", "focal_length")
+_CAMERA = {*PLACE, *_SIZE, *_POSE, "principal_point", "near", "file", "name", "mm_per_unit"}
+
+
+def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
+    r"""Load a scene, its camera and the settings of `render`.
+
+        material = "marble"          # a name, or a file beside this one; or the tables of a file
+        [splats]
+        file = "head.ply"            # or mesh = "head.glb", count and mm_per_unit; or bust = 200000
+        up = "y"                     # optional, as are scale = 1.0 and albedo = true
+        [camera]
+        position = [0, 0, 620]       # mm; target, up, and the vertical fov in degrees
+        target = [0, -40, 0]
+        fov = 25
+        width = 512
+        height = 512
+        [[lights]]
+        kind = "environment"         # or a kind of `read_observations`
+        image = "studio"             # overcast, sun, or a file; rotation, strength, up
+        [settings]                   # optional
+        bounces = 1
+        diffusion = "clusters"       # or shape
+
+    A camera is instead given by `position`, `rotation`, `focal_length` and `principal_point`, or by
+    `file`, `name` and `mm_per_unit` (`load_cameras`). The weights of a material that is named are
+    divided by their sums if the splats have albedo, as on the command line.
+
+    **Arguments:** `path`: of a TOML file, or of a picture that the command line rendered.
+
+    **Raises:** `ValueError` for any other content, with the fault and the remedy;
+    `FileNotFoundError` for a missing file.
+    """
+    file = scene_table(path)
+    splats = _splats(file.table("splats", _BODY))
+    if isinstance(name := file.entries.get("material"), str):
+        material = file.make(load_material, file.folder / name if Path(name).suffix else name)
+        material = material if splats.albedo is None else material.white()
+    else:
+        material = read_material(file.table("material", MATERIAL_TABLES))
+    lights = [light_of(each, material.channels) for each in file.tables("lights", LIGHT_ENTRIES)]
+    table = file.table("settings", ("bounces", "diffusion"))
+    diffuser = DIFFUSERS[table.one_of("diffusion", DIFFUSERS, "clusters")]
+    bounces = int(table.number("bounces", 0.0))
+    settings = table.make(RenderSettings, bounces=bounces, diffuser=diffuser)
+    scene = file.make(Scene, splats, lights, material)
+    return scene, _camera(file.table("camera", _CAMERA)), settings
+
+
+def scene_table(path: StrPath) -> Table:
+    """Return the contents of a scene's file, or of the manifest of a picture."""
+    path, record = Path(path), {}
+    if path.suffix.lower() == ".exr":
+        record = read_manifest(path)
+    entries = record.get("scene") if record else read_toml(path, "give a scene or a picture")
+    folder = path.parent / record.get("folder", "")
+    return Table(path, "", {"settings": {}} | (entries or {}), _TABLES, folder)
+
+
+def save_scene(
+    path: StrPath, scene: Scene, camera: Camera, settings: RenderSettings = RenderSettings()
+) -> None:
+    r"""Write a scene to a TOML file, its splats to a PLY file of the same name, and images of its
+    environments to EXR files; `load_scene` reads them.
+
+    Numbers are restored exactly, those of splats and environments in single precision.
+
+    **Raises:** `ValueError` for settings other than bounces and diffusion, and for lights that no
+    file can store; `OSError` if a file cannot be written.
+    """
+    import OpenImageIO as oiio  # 17 MB, so only where a picture is written
+
+    path, lights = Path(path), []
+    plain = RenderSettings(bounces=settings.bounces, diffuser=settings.diffuser)
+    if not eqx.tree_equal(settings, plain) or settings.diffuser not in DIFFUSERS.values():
+        raise ValueError(
+            f"{path}: stores only bounces and the default ClusterDiffuser or ShapeDiffuser; keep "
+            f"other settings in the program: {settings}"
+        )
+    for number, light in enumerate(scene.lights, 1):
+        image = path.with_name(f"{path.stem}_{number}.exr")
+        lights.append(plain_light(light, image.name))
+        if isinstance(light, EnvironmentLight):
+            with atomic_path(image) as temporary:
+                oiio.ImageBuf(np.asarray(light.image, np.float32)).write(str(temporary))
+    write_splats(path.with_suffix(".ply"), scene.splats)
+    splats = {"file": path.with_suffix(".ply").name}
+    write_toml(path, plain_scene(splats, scene.material, camera, lights, settings))
+
+
+def plain_scene(
+    splats: Mapping[str, Any],
+    material: Material,
+    camera: Camera,
+    lights: Sequence[Mapping[str, Any]],
+    settings: RenderSettings,
+) -> dict[str, Any]:
+    """Return the contents of a scene's file; [splats] and [[lights]] are given."""
+    pose = {name: getattr(camera, name) for name in (*_POSE, "principal_point")}
+    pose = {name: plain_numbers(value) for name, value in pose.items() if value is not None}
+    (diffusion,) = (name for name, each in DIFFUSERS.items() if each == settings.diffuser)
+    return {
+        "material": plain_material(material),
+        "splats": dict(splats),
+        "camera": pose | {name: getattr(camera, name) for name in (*_SIZE, "near")},
+        "lights": list(lights),
+        "settings": {"bounces": settings.bounces, "diffusion": diffusion},
+    }
+
+
+def _splats(table: Table) -> Splats:
+    if "bust" in table.entries:
+        splats = bust(int(table.number("bust")))
+    else:
+        up, mm_per_unit = table.entries.get("up", "y"), table.number("mm_per_unit", 1.0)
+        unit: dict[str, Any] = {"mm_per_unit": mm_per_unit, "up": up}
+        is_mesh = "mesh" in table.entries
+        body = table.folder / table.text("mesh" if is_mesh else "file")
+        count = int(table.number("count", 200_000.0))
+        splats = sample_mesh(body, count, **unit) if is_mesh else read_splats(body, **unit)
+    scale, albedo = table.number("scale", 1.0), table.one_of("albedo", (True, False), True)
+    splats = splats if scale == 1 else splats.scaled(scale)
+    return splats if albedo else replace(splats, albedo=None)
+
+
+def _camera(table: Table) -> Camera:
+    entries, height = table.entries, int(table.number("height", 512.0))
+    if "file" in entries:
+        file, name = table.folder / table.text("file"), str(entries.get("name", "0"))
+        camera = load_camera(file, name, mm_per_unit=table.number("mm_per_unit"))
+        return resized(camera, height) if "height" in entries else camera
+    width = int(table.number("width", float(height)))
+    if "target" in entries:
+        return look_at(table, width, height)
+    names = *_POSE, *(entries.keys() & {"principal_point"})
+    pose = {name: table.numbers(name) for name in names}
+    near = table.number("near", 1e-2)
+    return table.make(Camera, **pose, width=width, height=height, near=near)
