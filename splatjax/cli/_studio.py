@@ -43,6 +43,7 @@ class Studio(ViewOptions):
     def run(self) -> None:
         self.check(
             {
+                "half": (not self.half, "be off in the studio"),
                 "bounces": (self.bounces == 0, "be 0 in the studio"),
                 "diffusion": (self.diffusion == "clusters", "be clusters in the studio"),
                 "background": (self.background == "black", "be black in the studio"),

@@ -79,12 +79,15 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
 
 def scene_table(path: StrPath) -> Table:
     """Return the contents of a scene's file, or of the manifest of a picture."""
-    path, record = Path(path), {}
+    path = Path(path)
     if path.suffix.lower() == ".exr":
         record = read_manifest(path)
-    entries = record.get("scene") if record else read_toml(path, "give a scene or a picture")
-    folder = path.parent / record.get("folder", "")
-    return Table(path, "", {"settings": {}} | (entries or {}), _TABLES, folder)
+    else:
+        record = {"scene": read_toml(path, "give the file of a scene, or a picture")}
+    folder = path.parent / str(record.get("folder", ""))
+    table = Table(path, "", record.get("scene"), _TABLES, folder)
+    table.entries.setdefault("settings", {})
+    return table
 
 
 def save_scene(

@@ -43,6 +43,7 @@ eta = 1.5
 """,
     "media.csv": "name,sigma_a,sigma_s_prime,eta\na,0.002,2.6,1.5\n",
     "dark.toml": "[skin]\nmelanin = 0.15\n",
+    "scene.toml": 'material = "marble"\n',
 }
 REFUSED = {
     # Inputs that are missing, or something else.
@@ -56,7 +57,12 @@ REFUSED = {
     "fit marbel": ["marbel", "'marble'"],
     "materials marbel": ["marbel", "'marble'"],
     "render --material marbel": ["marbel"],
+    "render plate.ply --camera missing.json": ["missing.json", "no such file"],
+    "render plate.ply --camera picture.png:a": ["picture.png", "not a file of cameras"],
+    "render missing.toml": ["missing.toml", "scene"],
     # Contents.
+    "render scene.toml": ["scene.toml", "[splats] must be a table"],
+    "render scene.toml --azimuth 3": ["--azimuth is 3", "scene.toml"],
     "fit negative.toml": ["negative.toml", "sigma_a"],
     "render plate.ply --material negative.toml": ["negative.toml", "sigma_a"],
     "fit misspelt.toml": ["'roughnes'", "'roughness'"],
