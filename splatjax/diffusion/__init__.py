@@ -11,15 +11,13 @@ from ._clustered import (
     FINE_QUANTILE as FINE_QUANTILE,
     StreamedDiffusion as StreamedDiffusion,
 )
-from ._dense import (
-    dense_layer as dense_layer,
-    dense_layers as dense_layers,
-    DenseDiffuser as DenseDiffuser,
-)
 from ._diffuser import (
     AbstractDiffuser as AbstractDiffuser,
     AbstractDiffusionPlan as AbstractDiffusionPlan,
     Beams as Beams,
+    dense_layer as dense_layer,
+    dense_layers as dense_layers,
+    DenseDiffuser as DenseDiffuser,
     Diffused as Diffused,
     LayerValues as LayerValues,
     Sources as Sources,
