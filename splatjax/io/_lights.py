@@ -167,7 +167,7 @@ def _observation(table: Table) -> Observation:
 def look_at(table: Table, width: int, height: int) -> Camera:
     """Make the camera of a table of its place."""
     vectors = [table.numbers(name).tolist() for name in ("position", "target")]
-    up = table.numbers("up").tolist() if "up" in table.entries else None
+    up = table.numbers("up", [0.0, 1.0, 0.0]).tolist()
     size = {"width": width, "height": height}
     return table.make(Camera.look_at, *vectors, up=up, fov=table.number("fov", 25.0), **size)
 

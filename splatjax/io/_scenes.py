@@ -131,7 +131,7 @@ def plain_scene(
     """Return the contents of a scene's file; [splats] and [[lights]] are given."""
     pose = {name: getattr(camera, name) for name in (*_POSE, "principal_point")}
     pose = {name: plain_numbers(value) for name, value in pose.items() if value is not None}
-    (diffusion,) = (name for name, each in DIFFUSERS.items() if each == settings.diffuser)
+    diffusion = "shape" if isinstance(settings.diffuser, ShapeDiffuser) else "clusters"
     return {
         "material": plain_material(material),
         "splats": dict(splats),
