@@ -110,7 +110,7 @@ CHANGED = {
     "source": partial(mock.patch.object, sj.cache, "_source", lambda: b"another"),
     "processor": partial(mock.patch.object, sj.cache, "_processor", lambda: "another"),
     "XLA_FLAGS": partial(mock.patch.dict, os.environ, XLA_FLAGS="--xla_cpu_enable_fast_math=true"),
-    "settings": partial(jax.default_matmul_precision, "highest"),
+    "settings": partial(jax.numpy_rank_promotion, "allow"),
 }
 
 
