@@ -257,7 +257,8 @@ class ViewOptions:
         if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
             shown = np.asarray(lights[0].behind(frame, camera))
         elif self.background == "transparent":
-            shown = np.concatenate([shown, np.asarray(frame.coverage)[..., None]], axis=-1)
+            colors = np.repeat(shown, 3 // shown.shape[-1], axis=-1)  # of a scene in gray
+            shown = np.concatenate([colors, np.asarray(frame.coverage)[..., None]], axis=-1)
         sj.write_png(picture, shown, exposure=self.exposure)
         return path, picture
 
