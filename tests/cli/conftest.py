@@ -5,6 +5,7 @@ from bodies import PLAIN
 
 import splatjax as sj
 from splatjax.cli import _render, _view
+from splatjax.io import _scenes
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -21,6 +22,7 @@ def plain():
     """Plain renderers, whose program is small: what is tested here does not depend on them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_view.ViewOptions, "settings", PLAIN)
+        patch.setattr(_scenes, "RenderSettings", lambda **_: PLAIN)
         yield
 
 
