@@ -83,6 +83,8 @@ class Render(ViewOptions):
                     "diffusion": (self.diffusion == "clusters", "be clusters with --stream"),
                 },
             )
+        if self.camera_file is not None:
+            self.camera(tuple, self.azimuth)  # its file is read before anything is made
         options = self
         if self._scene:
             check_alone(self)
