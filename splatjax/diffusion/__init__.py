@@ -9,15 +9,16 @@ from ._clustered import (
     ClusterDiffuser as ClusterDiffuser,
     ClusterPlan as ClusterPlan,
     FINE_QUANTILE as FINE_QUANTILE,
-    StreamedDiffusion as StreamedDiffusion,
+)
+from ._dense import (
+    dense_layer as dense_layer,
+    dense_layers as dense_layers,
+    DenseDiffuser as DenseDiffuser,
 )
 from ._diffuser import (
     AbstractDiffuser as AbstractDiffuser,
     AbstractDiffusionPlan as AbstractDiffusionPlan,
     Beams as Beams,
-    dense_layer as dense_layer,
-    dense_layers as dense_layers,
-    DenseDiffuser as DenseDiffuser,
     Diffused as Diffused,
     LayerValues as LayerValues,
     Sources as Sources,
@@ -30,4 +31,5 @@ from ._kernel import (
     unevenness as unevenness,
 )
 from ._shape import ShapeDiffuser as ShapeDiffuser, ShapePlan as ShapePlan
+from ._streamed import StreamedDiffusion as StreamedDiffusion
 from ._clusters import POINTS_PER_BLOCK as POINTS_PER_BLOCK, compact_order as compact_order

@@ -1,40 +1,30 @@
-"""The fast diffuser: neighbors instead of all splats, and clusters of splats for wide layers. All
-splats are given, or read part by part.
-"""
+"""The fast diffuser: neighbors instead of all splats, and clusters of splats for wide layers."""
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import take_points
-from splatjax._combination import AbstractCombination, PartByPart
-from splatjax._precision import full_precision
+from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._clusters import (
-    POINTS_PER_BLOCK,
-    SOURCES_PER_BLOCK,
-    LayerSources,
-    SunkSources,
-    compact_order,
-)
+from ._clusters import POINTS_PER_BLOCK, SOURCES_PER_BLOCK, LayerSources, SunkSources
 from ._diffuser import (
     AbstractDiffuser,
     AbstractDiffusionPlan,
     Diffused,
     Sources,
-    divide_by_mass,
     layer_values,
 )
-from ._gaussian_sums import FAR, Targets, gaussian_sums, in_units, source_table, units_per_mm
+from ._gaussian_sums import SourceTable, Targets, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
-from ._neighbors import Boxes, Lists, find_neighbors, pairs_in_reach
+from ._neighbors import Boxes, Neighbors, find_neighbors
 
 # Quantile of the areas of the splats: a layer is resolved as far as splats of that area resolve it.
 FINE_QUANTILE = 0.01
@@ -78,21 +68,20 @@ class ClusterDiffuser(AbstractDiffuser):
             np.asarray(variances, np.float64), spacing, fine, kernel, interval
         )
         clusters = LayerSources.build(centers, normals, exists, edges.tolist())
-        splats = Sources(*map(jnp.asarray, (centers.T, normals.T, areas, areas[None])))
+        rows = (jnp.asarray(each) for each in (centers.T, normals.T, areas, areas[None]))
         own = jnp.asarray(sizes, variances.dtype)
-        points, boxes, sinking = _enclose(clusters, splats, own, self.margin, kernel)
+        points, boxes, sinking = _enclose(clusters, Sources(*rows), own, self.margin, kernel)
         # Sources of a wider layer lie deeper than those of the boxes.
         sinking = math.sqrt(3) * np.asarray(sinking, np.float64)
         reaches = np.where(edges < np.inf, supports * np.sqrt(sizes * self.margin) + sinking, 0)
-        lists = find_neighbors(points, boxes, clusters.layers, reaches.tolist(), parts=len(parts))
+        layers = np.asarray(clusters.layers)
+        lists = find_neighbors(points, boxes, layers, reaches.tolist(), parts=len(parts))
         endless = jnp.asarray(np.where(reaches > 0, reaches, np.inf), variances.dtype)
         return ClusterPlan(
             gaussians=jnp.asarray(gaussians, jnp.int32),
             sources=clusters,
             kernels=kernel.truncated(supports),
-            lists=lists,
-            boxes=(points, boxes),
-            reaches=endless,
+            neighbors=Neighbors(lists, points, boxes, clusters.layers, endless),
             variances=variances,
             margin=jnp.asarray(self.margin, variances.dtype),
         )
@@ -130,29 +119,24 @@ class ClusterDiffuser(AbstractDiffuser):
 
 
 class ClusterPlan(AbstractDiffusionPlan):
-    """The sources of one geometry and their neighbors, and the assumptions of their search.
+    """The sources and the neighbors of one geometry.
 
     **Attributes:**
 
     - `sources`: of every layer: splats, or clusters of them.
     - `kernels`: of every layer.
-    - `lists`: the blocks of sources within reach of every block of points.
-    - `boxes`: around the blocks of points, and the blocks of sources of all layers.
-    - `reaches`: of the layers, mm.
     - `variances`, `margin`: the plan is valid for variances within this factor of these, mm^2, or
       of the first of them.
     """
 
     sources: LayerSources
     kernels: TruncatedGaussian
-    lists: Lists
-    boxes: tuple[Boxes, Boxes]
-    reaches: Float[Array, " layers"]
+    neighbors: Neighbors
     variances: Float[Array, " gaussians"]
     margin: Float[Array, ""]
 
     def shares(self):
-        return tuple(jax.tree.leaves((self.lists, self.boxes[0])))
+        return tuple(jax.tree.leaves((self.neighbors.lists, self.neighbors.points)))
 
     def diffuse(
         self,
@@ -173,7 +157,7 @@ class ClusterPlan(AbstractDiffusionPlan):
         # Sink the sources and merge them; sum over those near each block of points.
         below = self.sources.merged(centered, depths)
         targets = Targets.of(at, points.shape[1] // POINTS_PER_BLOCK, POINTS_PER_BLOCK)
-        lists = self.lists
+        lists = self.neighbors.lists
         if at is not None:
             lists = lists.only(jnp.any(targets.ranks < targets.count, axis=1))
         sums = gaussian_sums(
@@ -195,16 +179,34 @@ class ClusterPlan(AbstractDiffusionPlan):
 
         # The needed over the planned capacity.
         around = _target_boxes(points, sources.areas), source_boxes(below)
-        moved = [now.beyond(then) for now, then in zip(around, self.boxes, strict=True)]
-        moved_sources = jax.ops.segment_max(moved[1], self.sources.layers, len(own))
-        moved = jnp.maximum(moved_sources, 0) + jnp.max(moved[0], initial=0)
         largest = self.kernels.largest.astype(own.dtype)
         reaches = jnp.sqrt(2 * largest * jax.lax.stop_gradient(own))
         planned = self.variances[: len(variances)]
         factors = jnp.maximum(planned / variances, variances / planned)
         varied = jnp.max(factors, initial=0) / (self.margin * (1 + 1e-6))
-        needed = jnp.maximum(varied, jnp.max((reaches + math.sqrt(3) * moved) / self.reaches))
+        needed = jnp.maximum(varied, self.neighbors.needed(*around, reaches))
         return Diffused(layers, combination.largest([needed.astype(variances.dtype)]))
+
+
+def in_units(
+    points: Float[Array, "blocks 3 block"], variances: Float[Array, " layers"]
+) -> Float[Array, "layers blocks 3 block"]:
+    """Express points, mm, in the unit of length of every layer."""
+    return units_per_mm(variances)[:, None, None, None] * points[None]
+
+
+def source_table(
+    below: SunkSources,
+    variances: Float[Array, " layers"],
+    layers: Int[Array, " blocks"],
+    moments: bool = True,
+) -> SourceTable:
+    """Arrange the sources of all layers: light and mass, with their first moments if requested."""
+    units = units_per_mm(variances)[layers][None, :, None]
+    centers = below.centers.reshape(3, -1, SOURCES_PER_BLOCK) * units
+    light = below.areas[None] * jnp.pad(below.irradiance, ((0, 1), (0, 0)), constant_values=1)
+    rows = light.reshape(len(light), -1, SOURCES_PER_BLOCK).swapaxes(0, 1)
+    return SourceTable(tuple(centers), rows, moments)
 
 
 def per_flat_mass(
@@ -212,6 +214,11 @@ def per_flat_mass(
 ) -> Float[Array, " layers"]:
     """Compute the factor that gives a flat sheet the mass 1."""
     return 1 / (2 * jnp.pi * variances * kernels.integral(0.5 * depths * depths / variances))
+
+
+def units_per_mm(variances: Float[Array, " layers"]) -> Float[Array, " layers"]:
+    """Compute the number of length units of `gaussian_sums`, `sqrt(2 v)`, per millimeter."""
+    return jnp.sqrt(0.5 / variances)
 
 
 def _target_boxes(points: Float[Array, "3 points"], areas: Float[Array, " points"]) -> Boxes:
@@ -242,88 +249,3 @@ def _enclose(
 def source_boxes(below: SunkSources) -> Boxes:
     """Enclose the sources of layers below their splats. Not differentiated."""
     return Boxes.around(below.centers, below.areas > 0, SOURCES_PER_BLOCK)
-
-
-class StreamedDiffusion:
-    """Evaluates the layers at points, from sources in parts.
-
-    Each part has its own cells, so a cell that two parts share counts as two, and cells are never
-    coarser than those of all splats together. Only the sums are kept, which do not grow with the
-    number of splats.
-    """
-
-    def __init__(
-        self,
-        diffuser: ClusterDiffuser,
-        kernel: AbstractDiffusionKernel,
-        variances: Float[Array, " gaussians"],
-        spacing: float,
-        fine: float,
-        interval: Float[Array, "2"],
-        points: Float[Array, "blocks 3 block"],
-        exists: Bool[Array, "blocks block"],
-    ):
-        """Prepare for points in compact blocks; `spacing`, `fine` and `interval` as for
-        `ClusterDiffuser.choose_layers`.
-        """
-        gaussians, sizes, edges, supports = diffuser.choose_layers(
-            np.asarray(variances, np.float64), spacing, fine, kernel, interval
-        )
-        self.gaussians = jnp.asarray(gaussians, jnp.int32)
-        self.variances, self.edges = jnp.asarray(sizes, variances.dtype), edges.tolist()
-        self.depths, self.kernels = kernel.depths(self.variances), kernel.truncated(supports)
-        self.reaches = np.where(edges < np.inf, supports * np.sqrt(sizes), 0).tolist()
-        self.points = jnp.where(exists[:, None], points, FAR)
-        self.boxes = Boxes.around(
-            jnp.moveaxis(self.points, 1, 0).reshape(3, -1), exists.reshape(-1), points.shape[2]
-        )
-        self.source_capacity, self.list_capacity = 0, 0
-
-    def evaluate(
-        self, parts: Iterable[Sources], channels: int
-    ) -> Float[Array, "blocks layers values block"]:
-        """Sum over all parts: means and mass of each layer, in the order of `gaussians`.
-
-        **Arguments:**
-
-        - `parts`: of one size, with centers from the origin of the points; sources without area do
-          not count.
-        - `channels`: of their irradiance.
-        """
-
-        count = self.points.shape[0] * self.points.shape[2]
-        zeros = jnp.zeros((len(self.edges), channels + 1, count), self.points.dtype)
-        sums = PartByPart().fold(self._add_part, zeros, parts)
-        return _finished(sums, self.variances, self.depths, self.kernels, self.points)
-
-    def _add_part(self, sums: Float[Array, "layers values points"], sources: Sources):
-        # Test by boxes whether any point is in reach; sources are below their splats.
-        around = Boxes.around(sources.centers, sources.areas > 0, len(sources.areas))
-        reach = np.max(self.reaches + np.asarray(self.depths, np.float64))
-        if not pairs_in_reach(self.boxes.corners, around.corners, reach)[0].size:
-            return sums
-        order = compact_order(np.asarray(sources.centers.T))
-        sources = jax.tree.map(lambda rows: rows[..., order], sources.of_layers(self.gaussians))
-        arrays = (np.asarray(each.T) for each in (sources.centers, sources.normals))
-        exists = np.asarray(sources.areas) > 0
-        clusters = LayerSources.build(*arrays, exists, self.edges, self.source_capacity)
-        below = clusters.merged(sources, self.depths)
-        given = self.boxes, source_boxes(below), clusters.layers, self.reaches
-        lists = find_neighbors(*given, least=self.list_capacity)
-        self.source_capacity, self.list_capacity = clusters.count, len(lists.rows)
-        return sums + _sum(self.points, below, clusters, self.variances, self.kernels, lists)
-
-
-@full_precision
-@eqx.filter_jit
-def _sum(points, below: SunkSources, clusters: LayerSources, variances, kernels, lists: Lists):
-    table = source_table(below, variances, clusters.layers, moments=False)
-    targets = Targets.of(None, points.shape[0], points.shape[2])
-    return gaussian_sums(in_units(points, variances), table, lists, kernels, targets)
-
-
-@eqx.filter_jit
-def _finished(sums, variances, depths, kernels: TruncatedGaussian, points):
-    rows = divide_by_mass(sums)
-    rows = rows.at[:, -1].multiply(per_flat_mass(kernels, variances, depths)[:, None])
-    return jnp.moveaxis(rows.reshape(*rows.shape[:2], points.shape[0], points.shape[2]), 2, 0)

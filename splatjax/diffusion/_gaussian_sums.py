@@ -14,7 +14,6 @@ from jaxtyping import Array, Float, Int
 from splatjax._chunking import zeros_after
 from splatjax._precision import full_precision
 
-from ._clusters import SOURCES_PER_BLOCK, SunkSources
 from ._kernel import TruncatedGaussian
 from ._neighbors import Lanes, Lists
 
@@ -92,11 +91,6 @@ class Targets(eqx.Module):
         ranks = jnp.full_like(every, len(at)).at[at].set(every[: len(at)], mode="drop")
         return cls(ranks.reshape(blocks, block), len(at))
 
-    def kernels(self, kernels: TruncatedGaussian, lanes: Lanes) -> TruncatedGaussian:
-        """Look up the kernel of each lane."""
-        layer = lanes.lists // len(self.ranks)
-        return TruncatedGaussian(kernels.largest.at[layer].get(mode="clip"))
-
     def _at(self, lanes: Lanes) -> tuple:
         """Index the layer, all sums, and the points of each lane."""
         layer, block = jnp.divmod(lanes.lists, len(self.ranks))
@@ -117,33 +111,56 @@ class Targets(eqx.Module):
         return jnp.swapaxes(sums.at[self._at(lanes)].get(mode="fill", fill_value=0), 1, 2)
 
 
+class _Sweep(eqx.Module):
+    """The common state of all sweeps. Not differentiated."""
+
+    kernels: TruncatedGaussian
+    lists: Lists
+    targets: Targets
+
+    def sweep(self, sweep, points, out):
+        """Apply `sweep(lanes, kernels of the lanes, points of the lanes, out)` to all lists."""
+
+        def with_points(lanes: Lanes, out):
+            layer = lanes.lists // len(self.targets.ranks)
+            kernels = jax.tree.map(lambda leaf: leaf.at[layer].get(mode="clip"), self.kernels)
+            return sweep(lanes, kernels, lanes.read(points, FAR), out)
+
+        return self.lists.sweep(with_points, out)
+
+    def sums(self, points, table: SourceTable, add):
+        """Sum over all sources of the points: `add(lanes, ids, kernels, points, sums)`."""
+        block = points.shape[2]
+
+        def sweep(lanes: Lanes, kernels, here, out):
+            start = jnp.zeros((len(here), table.count, block), here.dtype)
+            found = lanes.each_row(
+                self.lists, lambda ids, sums: add(lanes, ids, kernels, here, sums), start
+            )
+            return self.targets.write(out, lanes, found)
+
+        layers = len(self.kernels.largest)
+        out = zeros_after(table.rows, (layers, table.count, self.targets.count), points.dtype)
+        return self.sweep(sweep, points, out)
+
+
 def _weigh(kernels: TruncatedGaussian, points, sources: SourceTable):
-    """Compute weights `[lanes, sources, points]`, and minus their derivatives in the exponent."""
+    """Compute weights `[lanes, sources, points]`, minus their derivatives in the exponent, and
+    offsets.
+    """
     dx, dy, dz = (
         points[:, axis, None] - center[:, :, None] for axis, center in enumerate(sources.centers)
     )
-    return kernels(dx * dx + dy * dy + dz * dz)
+    return *kernels(dx * dx + dy * dy + dz * dz), (dx, dy, dz)
 
 
-def _forward(given, points, table: SourceTable):
-    kernels, lists, targets = given
-    block, layers = points.shape[2], len(kernels.largest)
+def _forward(given: _Sweep, points, table: SourceTable):
+    def add(lanes, ids, kernels, here, sums):
+        sources = table.gather(ids)
+        weights, *_ = _weigh(kernels, here, sources)
+        return sums + jnp.einsum("lrs,lsp->lrp", sources.rows_and_moments(), weights)
 
-    def sweep(lanes: Lanes, out):
-        here = points.at[lanes.lists].get(mode="fill", fill_value=FAR)
-        own = targets.kernels(kernels, lanes)
-
-        def add(ids, sums):
-            sources = table.gather(ids)
-            weights, _ = _weigh(own, here, sources)
-            return sums + jnp.einsum("lrs,lsp->lrp", sources.rows_and_moments(), weights)
-
-        start = jnp.zeros((len(here), table.count, block), here.dtype)
-        return targets.write(out, lanes, lanes.each_row(lists, add, start))
-
-    return lists.sweep(
-        sweep, zeros_after(table.rows, (layers, table.count, targets.count), points.dtype)
-    )
+    return given.sums(points, table, add)
 
 
 @full_precision
@@ -158,18 +175,16 @@ def _backward(residuals, cotangents):
     Both are moments of `g` over one side. Points and sources are relative to one of the sources, so
     that float32 does not cancel.
     """
-    (kernels, lists, targets), points, table = residuals
+    given, points, table = residuals
 
-    def sweep(lanes: Lanes, carry):
+    def sweep(lanes: Lanes, kernels, here, carry):
         d_points, d_table = carry
-        here = points.at[lanes.lists].get(mode="fill", fill_value=FAR)
-        own = targets.kernels(kernels, lanes)
-        cotangent = targets.read(cotangents, lanes)
+        cotangent = given.targets.read(cotangents, lanes)
 
         def add(ids, carry):
             d_here, d_table = carry
             sources = table.gather(ids)
-            weights, minus_slopes = _weigh(own, here, sources)
+            weights, minus_slopes, _ = _weigh(kernels, here, sources)
             centers = jnp.stack(sources.centers, axis=1)
             origin = centers[:, :, :1]
             x, p = here - origin, centers - origin
@@ -178,8 +193,9 @@ def _backward(residuals, cotangents):
             # Sum over the points: the cotangents of the sources.
             one_and_x = jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1)
             over_points = jnp.einsum("lkp,lsp->lks", one_and_x, g)
+            d_rows = jnp.einsum("lrp,lsp->lrs", cotangent, weights)
             d_centers = 2 * (over_points[:, 1:] - p * over_points[:, :1])
-            (d_sources,) = pull_rows(jnp.einsum("lrp,lsp->lrs", cotangent, weights))
+            (d_sources,) = pull_rows(d_rows)
             d_centers = jax.tree.map(
                 jnp.add, d_sources.centers, tuple(jnp.unstack(d_centers, axis=1))
             )
@@ -190,17 +206,20 @@ def _backward(residuals, cotangents):
             d_here = d_here - 2 * (x * over_sources[:, :1] - over_sources[:, 1:])
             return d_here, d_table.scatter_add(ids, d_sources)
 
-        d_here, d_table = lanes.each_row(lists, add, (jnp.zeros_like(here), d_table))
-        return d_points.at[lanes.lists].set(d_here, mode="drop"), d_table
+        d_here, d_table = lanes.each_row(given.lists, add, (jnp.zeros_like(here), d_table))
+        return lanes.write(d_points, d_here), d_table
 
     start = jax.tree.map(
         lambda each: zeros_after(cotangents, each.shape, each.dtype), (points, table)
     )
-    return None, *lists.sweep(sweep, start)
+    return given.sweep(sweep, points, start)
 
 
 _sums = jax.custom_vjp(_forward)
-_sums.defvjp(lambda *given: (_forward(*given), given), _backward)
+_sums.defvjp(
+    lambda *given: (_forward(*given), given),
+    lambda residuals, cotangents: (None, *_backward(residuals, cotangents)),
+)
 
 
 def gaussian_sums(
@@ -221,32 +240,7 @@ def gaussian_sums(
     - `targets`: the points of the sums.
     - `forward_mode`: differentiable only in forward mode, otherwise only in reverse mode. Static.
     """
+    given = _Sweep(kernels, lists, targets)
     # The loops have their own derivatives in forward mode.
     sums = _forward if forward_mode else _sums
-    return sums((kernels, lists, targets), points.reshape(-1, *points.shape[2:]), table)
-
-
-def in_units(
-    points: Float[Array, "blocks 3 block"], variances: Float[Array, " layers"]
-) -> Float[Array, "layers blocks 3 block"]:
-    """Express points, mm, in the unit of length of every layer."""
-    return units_per_mm(variances)[:, None, None, None] * points[None]
-
-
-def source_table(
-    below: SunkSources,
-    variances: Float[Array, " layers"],
-    layers: Int[Array, " blocks"],
-    moments: bool = True,
-) -> SourceTable:
-    """Arrange the sources of all layers: light and mass, with their first moments if requested."""
-    units = units_per_mm(variances)[layers][None, :, None]
-    centers = below.centers.reshape(3, -1, SOURCES_PER_BLOCK) * units
-    light = below.areas[None] * jnp.pad(below.irradiance, ((0, 1), (0, 0)), constant_values=1)
-    rows = light.reshape(len(light), -1, SOURCES_PER_BLOCK).swapaxes(0, 1)
-    return SourceTable(tuple(centers), rows, moments)
-
-
-def units_per_mm(variances: Float[Array, " layers"]) -> Float[Array, " layers"]:
-    """Compute the number of length units of `gaussian_sums`, `sqrt(2 v)`, per millimeter."""
-    return jnp.sqrt(0.5 / variances)
+    return sums(given, points.reshape(-1, *points.shape[2:]), table)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -18,9 +17,6 @@ LANES = 256  # blocks of points that are swept together
 _ROWS = 7  # for every block of points: more than most bodies need, so that they share a program
 _AT_ONCE = 1 << 13  # pairs of boxes whose parts are tested together: they stay in cache
 _FAN = 4  # parts of a box of a coarser level
-
-Corners = tuple[Float[np.ndarray, "_boxes 3"], Float[np.ndarray, "_boxes 3"]]
-Pairs = tuple[Int[np.ndarray, " _pairs"], Int[np.ndarray, " _pairs"]]
 
 
 class Lists(eqx.Module):
@@ -72,6 +68,12 @@ class Lanes(eqx.Module):
     first: Int[Array, " lanes"]
     counts: Int[Array, " lanes"]
 
+    def read(self, rows: Float[Array, "lists ..."], fill=0.0):
+        return rows.at[self.lists].get(mode="fill", fill_value=fill)
+
+    def write(self, rows: Float[Array, "lists ..."], values):
+        return rows.at[self.lists].set(values, mode="drop")
+
     def each_row(self, lists: Lists, add: Callable, start):
         """Apply `add(ids, carry)` to the blocks of sources `[lanes, width]` of row after row."""
 
@@ -99,21 +101,41 @@ class Boxes(eqx.Module):
         )
         return cls(jnp.min(low, axis=2).T, jnp.max(high, axis=2).T)
 
-    @property
-    def corners(self) -> Corners:
-        """The low and the high corners, for NumPy."""
-        return np.asarray(self.low), np.asarray(self.high)
-
     def beyond(self, planned: "Boxes") -> Float[Array, " blocks"]:
         """Measure the distance (mm, along an axis) by which each box exceeds the planned one."""
         out = jnp.maximum(planned.low - self.low, self.high - planned.high)
         return jnp.maximum(jnp.max(jnp.where(self.low <= self.high, out, 0), axis=1), 0)
 
 
+class Neighbors(eqx.Module):
+    """The blocks of sources within reach of every block of points, and the assumptions of the
+    search.
+
+    **Attributes:**
+
+    - `layers`: of the blocks of sources.
+    - `reaches`: of the layers, mm.
+    """
+
+    lists: Lists
+    points: Boxes
+    sources: Boxes
+    layers: Int[Array, " blocks"]
+    reaches: Float[Array, " layers"]
+
+    def needed(
+        self, points: Boxes, sources: Boxes, reaches: Float[Array, " layers"]
+    ) -> Float[Array, ""]:
+        """Compute a number above 1 if sources within reach of points may be missing."""
+        moved = jax.ops.segment_max(sources.beyond(self.sources), self.layers, len(reaches))
+        moved = jnp.maximum(moved, 0) + jnp.max(points.beyond(self.points), initial=0)
+        return jnp.max((reaches + math.sqrt(3) * moved) / self.reaches)
+
+
 def find_neighbors(
     points: Boxes,
     sources: Boxes,
-    layers: Int[Array, " blocks"] | Int[np.ndarray, " blocks"],
+    layers: Int[np.ndarray, " blocks"],
     reaches: Sequence[float],
     parts: int = 1,
     least: int = 0,
@@ -130,68 +152,86 @@ def find_neighbors(
     - `parts`: equal parts of the points, each with separate lists, one after the other.
     - `least`: rows of each part.
     """
-    low, high = sources.corners
-    corners = (np.split(corner, parts) for corner in points.corners)
-    own = [np.flatnonzero(np.asarray(layers) == layer) for layer in range(len(reaches))]
-    blocks = len(points.low) // parts
-    lists = blocks * len(reaches)  # of a part
+    low, high = (np.asarray(each) for each in (sources.low, sources.high))
+    corners = (np.split(np.asarray(corner), parts) for corner in (points.low, points.high))
+    own = [np.flatnonzero(layers == layer) for layer in range(len(reaches))]
 
-    def search(part: Corners, layer: int) -> Pairs:
-        """Find the pairs of a list of a part and a block of sources."""
+    def search(part: tuple, layer: int):
+        """Find the pairs of a block of a part and a block of sources."""
         of, near = pairs_in_reach(part, (low[own[layer]], high[own[layer]]), reaches[layer])
-        return layer * blocks + of, own[layer][near]
+        return of, own[layer][near]
 
-    found = []
     # Only NumPy computes in the threads, since JAX's precision may be set for one thread.
+    of_parts = list(zip(*corners, strict=True))
     with ThreadPoolExecutor() as pool:
-        for part in zip(*corners, strict=True):
-            pairs = pool.map(partial(search, part), range(len(reaches)))
-            of, near = (np.concatenate(each) for each in zip(*pairs, strict=True))
-            rows, counts = in_rows(of, near, lists, BLOCKS_PER_ROW, len(low))
-            order = np.argsort(-counts, kind="stable")
-            found.append((rows, np.cumsum(counts) - counts, counts, order))
+        pairs = [
+            [pool.submit(search, part, layer) for layer in range(len(reaches))] for part in of_parts
+        ]
+    blocks = len(of_parts[0][0])
+    found = [_lists([each.result() for each in part], blocks, len(low)) for part in pairs]
     # At least one row, the last, stays empty: lanes whose list has ended read it.
-    most = max(len(rows) for rows, *_ in found)
-    count = max(least, _ROWS * lists, with_spare(("rows", lists), most, 1, per_octave=2))
+    lists = len(found[0][1])
+    rows = max(len(ids) for ids, *_ in found)
+    count = max(least, _ROWS * lists, with_spare(("rows", lists), rows, 1, per_octave=2))
     padded = [
-        (np.pad(rows, ((0, count - len(rows)), (0, 0)), constant_values=len(low)), *each)
-        for rows, *each in found
+        (np.pad(ids, ((0, count - len(ids)), (0, 0)), constant_values=len(low)), *each)
+        for ids, *each in found
     ]
     whole = (np.concatenate(each) for each in zip(*padded, strict=True))
     return Lists(*(jnp.asarray(each, jnp.int32) for each in whole))
 
 
-def in_rows(
-    targets: Int[np.ndarray, " pairs"],
-    sources: Int[np.ndarray, " pairs"],
-    count: int,
-    width: int,
-    empty: int,
-) -> tuple[Int[np.ndarray, "rows width"], Int[np.ndarray, " targets"]]:
-    """Sort the sources of pairs into rows of one target each, targets in ascending order; `empty`
-    fills rows up. Also return the number of rows of each of `count` targets.
+def _lists(pairs: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, empty: int):
+    """Return the rows of blocks of sources; for every list its first row and their number; and the
+    order of the lists.
+
+    **Arguments:**
+
+    - `pairs`: of each layer, the blocks of points and of sources that are in reach.
+    - `blocks`: of points.
+    - `empty`: the index for no block of sources.
     """
-    order = np.argsort(targets, kind="stable")
-    targets, sources = targets[order], sources[order]
-    lengths = np.bincount(targets, minlength=count)
-    counts = -(-lengths // width)
+    of = np.concatenate([layer * blocks + each for layer, (each, _) in enumerate(pairs)])
+    near = np.concatenate([each for _, each in pairs])
+    by_list = np.argsort(of, kind="stable")
+    of, near = of[by_list], near[by_list]
+    lengths = np.bincount(of, minlength=blocks * len(pairs))
+    counts = -(-lengths // BLOCKS_PER_ROW)
     first, begins = (np.cumsum(each) - each for each in (counts, lengths))
-    rows = np.full((counts.sum(), width), empty, np.int32)
-    rows.reshape(-1)[(first * width - begins)[targets] + np.arange(len(targets))] = sources
-    return rows, counts
+    ids = np.full((counts.sum(), BLOCKS_PER_ROW), empty, np.int32)
+    ids.reshape(-1)[(first * BLOCKS_PER_ROW - begins)[of] + np.arange(len(of))] = near
+    return ids, first, counts, np.argsort(-counts, kind="stable")
 
 
-def pairs_in_reach(points: Corners, sources: Corners, reach: float) -> Pairs:
+def _levels(corners: tuple, depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the corners `[3, parents, parts]` of boxes, `_FAN` of them to a parent, and of ever
+    coarser boxes around these; empty boxes fill each level.
+    """
+    levels, corners = [], tuple(np.asarray(corner).T for corner in corners)
+    for _ in range(depth):
+        lacking = ((0, 0), (0, -corners[0].shape[1] % _FAN))
+        low, high = (
+            np.pad(each, lacking, constant_values=empty).reshape(3, -1, _FAN)
+            for each, empty in zip(corners, (np.inf, -np.inf), strict=True)
+        )
+        levels.append((low, high))
+        corners = low.min(axis=2), high.max(axis=2)
+    return levels
+
+
+def pairs_in_reach(points: tuple, sources: tuple, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Find the pairs of boxes, given by their corners, that are in reach of each other, from coarse
     to fine.
     """
     if not reach:
-        return np.zeros(0, int), np.zeros(0, int)
+        return np.zeros(0, np.int32), np.zeros(0, np.int32)
     depth = math.ceil(math.log(max(len(points[0]), len(sources[0]), 2), _FAN))
-    levels = zip(_levels(points, depth), _levels(sources, depth), strict=True)
-    own, other = np.zeros((2, 1), int)
-    for of_points, of_sources in reversed(list(levels)):
-        found = [np.zeros((2, 0), int)]
+    each = zip(_levels(points, depth), _levels(sources, depth), strict=True)
+    levels = [(*of_points, *of_sources) for of_points, of_sources in each]
+    root, none = np.zeros(1, np.int32), np.zeros(0, np.int32)
+    todo, found = [(depth - 1, root, root)], [(none, none)]
+    while todo:
+        level, own, other = todo.pop()
         for begin in range(0, len(own), _AT_ONCE):
             a, b = own[begin : begin + _AT_ONCE], other[begin : begin + _AT_ONCE]
             gaps = (
@@ -199,26 +239,14 @@ def pairs_in_reach(points: Corners, sources: Corners, reach: float) -> Pairs:
                     low_a[a][:, :, None] - high_b[b][:, None],
                     low_b[b][:, None] - high_a[a][:, :, None],
                 )
-                for low_a, high_a, low_b, high_b in zip(*of_points, *of_sources, strict=True)
+                for low_a, high_a, low_b, high_b in zip(*levels[level], strict=True)
             )
             squared = sum(np.square(np.maximum(gap, 0)) for gap in gaps)
             pair, part, other_part = np.nonzero(squared <= reach * reach)
-            found.append(np.stack([a[pair] * _FAN + part, b[pair] * _FAN + other_part]))
-        own, other = np.concatenate(found, axis=1)
+            pairs = a[pair] * _FAN + part, b[pair] * _FAN + other_part
+            if level == 0:
+                found.append(pairs)
+            else:
+                todo.append((level - 1, *pairs))
+    own, other = (np.concatenate(each) for each in zip(*found, strict=True))
     return own, other
-
-
-def _levels(corners: Corners, depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the corners `[3, parents, parts]` of boxes, `_FAN` of them to a parent, and of ever
-    coarser boxes around these; empty boxes fill up all levels.
-    """
-    low, high = (
-        np.pad(corner.T, ((0, 0), (0, -len(corner) % _FAN**depth)), constant_values=empty)
-        for corner, empty in zip(corners, (np.inf, -np.inf), strict=True)
-    )
-    levels = []
-    for _ in range(depth):
-        low, high = low.reshape(3, -1, _FAN), high.reshape(3, -1, _FAN)
-        levels.append((low, high))
-        low, high = low.min(axis=2), high.max(axis=2)
-    return levels

@@ -2,7 +2,6 @@
 Gaussians.
 """
 
-from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -182,19 +181,12 @@ class LayersAtPoints(eqx.Module):
           multiplied by them.
         - `single_scattering_albedo`: the fraction that leaves a flat surface as single scattering.
         """
-        given = gaussians.weights[:, :, None], self.variances[:, None, None]
-        layers, resolved = self._weigh(*given, single_scattering_albedo)
+        weights, variances = gaussians.weights[:, :, None], self.variances[:, None, None]
+        given = weights, variances, single_scattering_albedo, self.means, self.mass[:, None]
+        layers, resolved = self._weigh(*given)
         return layers, resolved[:, 0]
 
-    def _weigh(self, weights, variances, single_scattering_albedo):
-        means, mass, own_variances = self.means, self.mass[:, None], self.variances[:, None, None]
-        if self.derivative is None:
-            variances = own_variances
-        else:
-            # Means and mass at the other variances, to first order.
-            moved = jnp.log(variances / own_variances)
-            means = means + moved * self.derivative[0]
-            mass = jnp.maximum(mass + moved * self.derivative[1][:, None], 0)
+    def _weigh(self, weights, variances, single_scattering_albedo, means, mass):
         resolved = resolved_fraction(variances, self.area[None, None], self.interval)
         resolved = jnp.where(mass > 0, resolved, 0.0)
         own, root = self.irradiance[None], 1.0
@@ -223,7 +215,15 @@ class LayersAtPoints(eqx.Module):
         return self._exitance(weights, variances, jnp.zeros_like(weights[0, :, 0]))
 
     def _exitance(self, weights, variances, single_scattering_albedo):
-        layers, _ = self._weigh(weights, variances, single_scattering_albedo)
+        own = self.variances[:, None, None]
+        means, mass = self.means, self.mass[:, None]
+        if self.derivative is None:
+            variances = own
+        else:
+            moved = jnp.log(variances / own)
+            means = means + moved * self.derivative[0]
+            mass = jnp.maximum(mass + moved * self.derivative[1][:, None], 0)
+        layers, _ = self._weigh(weights, variances, single_scattering_albedo, means, mass)
         return jnp.sum(weights * layers, axis=0)
 
     def exitance_jacobian(
@@ -240,7 +240,10 @@ class LayersAtPoints(eqx.Module):
             raise ValueError("derivative is None; compute the layers with derivative=True")
         # Points and channels are independent, so one derivative gives those of all.
         own = gaussians.weights[:, :, None], gaussians.variances[:, None, None]
-        own = (jnp.broadcast_to(each, self.means.shape) for each in own)
-        exitance = partial(self._exitance, single_scattering_albedo=single_scattering_albedo)
+        own = tuple(jnp.broadcast_to(each, self.means.shape) for each in own)
+
+        def exitance(weights, variances):
+            return self._exitance(weights, variances, single_scattering_albedo)
+
         total, pull = jax.vjp(exitance, *own)
         return pull(jnp.ones_like(total))

@@ -1,10 +1,8 @@
 """The diffusion equation in a body, as an integral equation over its splats."""
 
 import dataclasses
-from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,17 +13,19 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
 
+from ._beams import DiffusionCoefficients, scattered_once
 from ._diffuser import AbstractDiffuser, AbstractDiffusionPlan, Beams, Diffused, LayerValues
+from ._emission import SolvedLight, radiance_towards
 from ._hierarchy import Hierarchy, padded_count
-from ._rays import DiffusionCoefficients, SolvedLight, radiance_towards, scattered_once
-from ._surface_sums import SOFTENED, ScreenedKernel, SurfaceSums
+from ._krylov import solve
+from ._screened import SOFTENED, ScreenedKernel
+from ._surface_sums import SurfaceSums
 
 _SOFTENING = 2**-0.25  # length over the spacing
 _FINER = 2**-0.5  # softening of the sources, over that on the surface
 _LEAST_KAPPA = 1e-3  # over the root of the area
 _OPEN = 0.05  # sum of the normals, by area, over the area: an open neck leaves 0.08
 _WIDE = 1e12  # mm^2: resolved everywhere
-_MOST = 24  # products of the solver
 
 
 class ShapeDiffuser(AbstractDiffuser):
@@ -72,9 +72,9 @@ class ShapeDiffuser(AbstractDiffuser):
     def radiant_exitance(
         self,
         splats: Splats,
-        medium: Medium | None,
+        medium: Medium,
         beams: Beams,
-        hierarchy: Hierarchy,
+        hierarchy: Hierarchy | None = None,
         bounced: Float[Array, "channels splats"] | None = None,
     ) -> Float[Array, "channels splats"]:
         """Solve for the light that leaves every splat, in the unit of the irradiance; light that
@@ -83,11 +83,16 @@ class ShapeDiffuser(AbstractDiffuser):
 
         **Arguments:**
 
-        - `hierarchy`: from `find_hierarchy`.
+        - `hierarchy`: from `find_hierarchy`; needed under `jit`.
         - `bounced`: irradiance of uniform light that enters beside the beams.
+
+        **Raises:** `ValueError` as `find_hierarchy`, if none is given.
         """
-        surface = SurfaceSums.of(splats, hierarchy)
-        beams, bounced = surface.padded((beams, bounced))
+        hierarchy = self.find_hierarchy(splats) if hierarchy is None else hierarchy
+        exitance = self._solve(SurfaceSums.of(splats, hierarchy), medium, beams, bounced)
+        return exitance[:, : splats.count]
+
+    def _solve(self, surface: SurfaceSums, medium: Medium, beams: Beams, bounced=None):
         coefficients, area = DiffusionCoefficients.of(medium), jnp.sum(surface.areas)
         spread = jnp.sqrt(jnp.sum(surface.areas**2) / area)
         # A medium without absorption is the limit of a small kappa: the square of this fraction is
@@ -95,26 +100,33 @@ class ShapeDiffuser(AbstractDiffuser):
         kappa = jnp.sqrt(coefficients.squared_kappa + _LEAST_KAPPA**2 / area)
         kernel = ScreenedKernel(kappa, _SOFTENING * spread)
         finer = ScreenedKernel(kappa, _FINER * kernel.length)
-        source, leaving = scattered_once(surface, coefficients, finer, beams)
+        more = ((0, 0), (0, len(surface.areas) - beams.irradiance.shape[1]))
+        entering = jnp.pad(beams.irradiance, more), jnp.pad(beams.directions, ((0, 0), *more))
+        source, leaving = scattered_once(surface, coefficients, finer, *entering)
 
         exists = (surface.areas > 0)[None]
         one, z_e = jnp.ones_like(surface.areas)[None], coefficients.z_e
         share = -surface.layers(ScreenedKernel(jnp.zeros(1, z_e.dtype), kernel.length), [0.0], one)
         # The part that softening removes uses phi of its own splat.
-        unseen = kernel.plane_integral(jnp.zeros_like(z_e)[:, None])
-        diagonal = jnp.where(exists, share + unseen / z_e[:, None], 1.0)
+        own = kernel.plane_integral(jnp.zeros_like(z_e)[:, None])
+        diagonal = share + own / z_e[:, None]
+        diagonal = jnp.where(exists, diagonal, 1.0)
 
         def product(phi):
             return phi + surface.layers(kernel, list(1 / z_e), phi) / diagonal
 
-        flux = (coefficients.diffusion_coefficient / z_e)[:, None]
         if bounced is not None:
-            leaving = leaving + (1 - flux * coefficients.inward[:, None]) * bounced
-            inward = (coefficients.inward / z_e)[:, None] * bounced
+            inward = jnp.pad((coefficients.inward / z_e)[:, None] * bounced, more)
+            unseen = kernel.plane_integral(jnp.zeros_like(inward))
             single_layer = surface.layers(kernel, [1.0] * len(z_e), inward, dipole=0.0)
             source = source + single_layer + unseen * inward
         right = jnp.where(exists, source / diagonal, 0.0)
-        return (flux * solve(product, right, self.error) + leaving)[:, : splats.count]
+        phi = solve(product, right, self.error)
+        flux = (coefficients.diffusion_coefficient / z_e)[:, None]
+        exitance = flux * phi + leaving
+        if bounced is not None:
+            exitance = exitance + jnp.pad((1 - flux * coefficients.inward[:, None]) * bounced, more)
+        return exitance
 
     def find_hierarchy(self, splats: Splats) -> Hierarchy:
         """Check that the splats bound a body, and choose near splats and clusters. Not for traced
@@ -190,11 +202,11 @@ class ShapePlan(AbstractDiffusionPlan):
         return dataclasses.replace(shown, medium=material.medium)
 
     def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
-        surface, entering = SurfaceSums.of(splats, self.hierarchy), beams()
-        given = splats, material.medium, entering, self.hierarchy, bounced
-        exitance = self.diffuser.radiant_exitance(*given)
-        padded = surface.padded((exitance, entering, bounced))
-        solved = SolvedLight.of(surface, material, *padded)
+        medium, entering = material.medium, beams()
+        assert medium is not None
+        surface = SurfaceSums.of(splats, self.hierarchy)
+        exitance = self.diffuser._solve(surface, medium, entering, bounced)
+        solved = SolvedLight.of(surface, material, exitance, entering, bounced)
         values = jnp.concatenate([exitance, jnp.ones_like(exitance[:1])])
         rows = values[None], jnp.pad(solved.slopes, ((0, 1), (0, 0), (0, 0)))[None]
         at = jnp.arange(splats.count) if at is None else at
@@ -215,51 +227,3 @@ class ShapePlan(AbstractDiffusionPlan):
             "ShapeDiffuser solves for the lights of a scene, not for a given irradiance, nor for "
             "derivatives by Gaussians; render with ClusterDiffuser"
         )
-
-
-def solve(
-    product: Callable, right: Float[Array, "systems unknowns"], error: float
-) -> Float[Array, "systems unknowns"]:
-    """Solve independent systems of linear equations, by generalized conjugate residuals, until
-    every residual is at most `error` times the right side, root mean squares compared.
-    Differentiable by the implicit function theorem.
-
-    **Returns:** the unknowns; NaN in a system that 24 products do not solve.
-
-    **Source:** Eisenstat, Elman and Schultz 1983, "Variational Iterative Methods for Nonsymmetric
-    Systems of Linear Equations"; the iterates are those of GMRES.
-    """
-
-    def iterate(product, right):
-        length = _lengths(right)
-        length = jnp.where(length > 0, length, 1.0)
-        none = jnp.zeros((_MOST, *right.shape), right.dtype)
-
-        def step(state):
-            count, solution, residual, directions, images = state
-            direction, image = residual, product(residual)
-            # Make the image orthogonal to all before; again, for what rounding left.
-            for _ in range(2):
-                along = jnp.einsum("msu,su->ms", images, image)
-                image = image - jnp.einsum("ms,msu->su", along, images)
-                direction = direction - jnp.einsum("ms,msu->su", along, directions)
-            size = _lengths(image)
-            inverse = 1 / jnp.where(size > 0, size, 1.0)
-            direction, image = inverse * direction, inverse * image
-            share = jnp.sum(residual * image, axis=1, keepdims=True)
-            solution, residual = solution + share * direction, residual - share * image
-            directions, images = directions.at[count].set(direction), images.at[count].set(image)
-            return count + 1, solution, residual, directions, images
-
-        def is_unsolved(state):
-            return (state[0] < _MOST) & (jnp.max(_lengths(state[2])) > error)
-
-        start = jnp.int32(0), none[0], right / length, none, none
-        _, solution, residual, *_ = jax.lax.while_loop(is_unsolved, step, start)
-        return length * jnp.where(_lengths(residual) <= error, solution, jnp.nan)
-
-    return jax.lax.custom_linear_solve(product, right, iterate, iterate)
-
-
-def _lengths(rows: Float[Array, "systems unknowns"]) -> Float[Array, "systems 1"]:
-    return jnp.sqrt(jnp.sum(rows * rows, axis=1, keepdims=True))

@@ -213,7 +213,7 @@ def _sum_views(
         for k, view in enumerate(views)
     ]
 
-    def parts() -> Iterator[list[_splatting.Sweep]]:
+    def parts() -> Iterator[list[_splatting.PartSweep]]:
         for scene in scenes(task):
             attributes = rows(scene)
             yield [

@@ -6,21 +6,21 @@ from ._bins import (
     bin_items as bin_items,
     BinCapacity as BinCapacity,
     Bins as Bins,
-    TILE_SIDE as TILE_SIDE,
-    TileGrid as TileGrid,
-    TileRanges as TileRanges,
+    scatter_slots as scatter_slots,
+    slot_plane as slot_plane,
 )
+from ._dense import DenseRasterizer as DenseRasterizer
 from ._views import (
     AbstractView as AbstractView,
     Footprints as Footprints,
     SplattingSettings as SplattingSettings,
 )
+from ._grid import TILE_SIDE as TILE_SIDE, TileGrid as TileGrid, TileRanges as TileRanges
 from ._projections import OrthographicView as OrthographicView, PerspectiveView as PerspectiveView
 from ._rasterizer import (
     AbstractRasterizer as AbstractRasterizer,
     AbstractRasterPlan as AbstractRasterPlan,
     coverage as coverage,
-    DenseRasterizer as DenseRasterizer,
     fragment_weight as fragment_weight,
     FragmentSums as FragmentSums,
     invalid_factor as invalid_factor,
@@ -49,6 +49,5 @@ from ._surfaces import (
     visible_surfaces as visible_surfaces,
     VisibleSurfaces as VisibleSurfaces,
 )
-from ._fragments import Sweep as Sweep
-from ._sweeps import sum_parts as sum_parts
+from ._sweeps import PartSweep as PartSweep, sum_parts as sum_parts
 from ._tiles import TilePlan as TilePlan, TileRasterizer as TileRasterizer

@@ -5,20 +5,20 @@ Fragments are computed relative to their tile, so that float32 suffices at any r
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Shaped
 
-from ._bins import TILE_SIDE, Bins, TileGrid
+from ._bins import Bins, slot_plane
+from ._grid import TILE_SIDE, TileGrid
 from ._rasterizer import (
     PixelSums,
     fast_fragment_weight,
     fragment_weight_derivative,
     least_weight,
 )
-from ._views import AbstractView, SplattingSettings
+from ._views import AbstractView
 
 # Fields of the footprints on which sums depend.
 PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")
@@ -30,8 +30,8 @@ class Lanes(eqx.Module):
 
     **Attributes:**
 
-    - `row`: of the lane's first block in the slots, whose arrays are `[blocks * lanes, slots]`;
-      block b is at `row + b * stride`.
+    - `row`: of the lane's first block in `Slots`, whose arrays are `[blocks * lanes, slots]`; block
+      b is at `row + b * stride`.
     - `lengths`: of the lane's chunk, in blocks; the blocks after it belong to the next chunk.
     - `blocks`: the largest of the lengths.
     - `x`, `y`: corners, pixels.
@@ -47,177 +47,183 @@ class Lanes(eqx.Module):
     def read(self, plane: Shaped[Array, "rows slots"], block) -> Shaped[Array, "lanes slots"]:
         return plane.at[self.row + block * self.stride].get(mode="promise_in_bounds")
 
+    def add(
+        self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]
+    ) -> Float[Array, "rows slots"]:
+        return plane.at[self.row + block * self.stride].add(part, mode="promise_in_bounds")
+
+    def until_end(
+        self, far_limit: Float[Array, "lanes pixels"], block
+    ) -> Float[Array, "lanes pixels"]:
+        """Exclude all fragments of the lanes whose list has ended before a block."""
+        return jnp.where((block < self.lengths)[:, None], far_limit, jnp.inf)
+
 
 class Sweep(eqx.Module):
-    """Splats in the lists of the tiles, and loops over their fragments in some lanes. The splats
-    may be one of several parts: those of another part may be in front.
+    """The settings of a sweep, and its inner loops over the blocks of some lanes.
 
     **Attributes:**
 
     - `view_class`: fragments need the formulas of a view, not its position. Static.
-    - `ids`, `planes`, `shift`: of the splats, gathered into slots, in rows of one lane each.
-    - `attributes`: of the splats; they are too many for slots.
     """
 
     view_class: type[AbstractView] = eqx.field(static=True)
     grid: TileGrid
-    settings: SplattingSettings
-    bins: Bins
-    ids: Int[Array, "rows slots"]
-    planes: list[Float[Array, "rows slots"]]
-    shift: Float[Array, "rows slots"]
-    attributes: Float[Array, "splats attributes"]
+    full_coverage: float = eqx.field(static=True)
+    filter_radius: float = eqx.field(static=True)
 
-    @classmethod
-    def of(
-        cls,
-        view_class: type[AbstractView],
-        grid: TileGrid,
-        settings: SplattingSettings,
-        bins: Bins,
-        shift: Float[Array, " splats"],
-        planes: tuple[Float[Array, " splats"], ...],
-        attributes: Float[Array, "splats attributes"],
-    ) -> "Sweep":
-        """Gather splats into the slots of the bins."""
-        ids = bins.ids.reshape(-1, grid.slots)
-        own_shift, *own = (
-            plane.at[ids].get(mode="fill", fill_value=fill)
-            for plane, fill in zip((shift, *planes), (0.0, *_EMPTY), strict=True)
-        )
-        return cls(view_class, grid, settings, bins, ids, own, own_shift, attributes)
+    def within_picture(self, sums: PixelSums, tiles: Int[Array, " lanes"]) -> PixelSums:
+        """Set pixels of a tile beyond the picture to zero."""
+        if self.grid.width % TILE_SIDE == 0 and self.grid.height % TILE_SIDE == 0:
+            return sums
+        within = self.grid.within_picture(tiles)
+        rows = jnp.where(within[:, None], sums.rows, 0.0)
+        return PixelSums(rows, jnp.where(within, sums.weights, 0.0))
 
-    def pixels(self) -> tuple[np.ndarray, np.ndarray]:
+    def pixels(self, dtype) -> tuple[np.ndarray, np.ndarray]:
         """Pixel centers of a tile, from its corner. They are NumPy constants; the compiler would
         otherwise compute them per fragment.
         """
-        side = np.arange(TILE_SIDE, dtype=self.shift.dtype) + np.asarray(0.5, self.shift.dtype)
+        side = np.arange(TILE_SIDE, dtype=dtype) + np.asarray(0.5, dtype)
         return np.tile(side, TILE_SIDE), np.repeat(side, TILE_SIDE)
 
-    def lanes(self, lane_numbers: Int[Array, " lanes"]) -> Lanes:
+    def lanes(self, bins: Bins, lane_numbers: Int[Array, " lanes"], dtype) -> Lanes:
         """Look up lanes by their number in `bins.order`; those from `bins.planned_lanes` on are
         empty and have length 0.
         """
-        bins, lanes, across = self.bins, self.grid.lanes, self.grid.across
+        lanes, across = self.grid.lanes, self.grid.across
         exist = lane_numbers < bins.planned_lanes
         lane_numbers = jnp.minimum(lane_numbers, bins.planned_lanes - 1)
         tiles, chunk = bins.order[lane_numbers], lane_numbers // lanes
         row = bins.first_block[chunk] * lanes + lane_numbers % lanes
         lengths = jnp.where(exist, bins.first_block[chunk + 1] - bins.first_block[chunk], 0)
         x, y = (
-            (index * TILE_SIDE).astype(self.shift.dtype)[:, None]
+            (index * TILE_SIDE).astype(dtype)[:, None]
             for index in (tiles % across, tiles // across)
         )
         return Lanes(row, lengths, jnp.max(lengths), x, y, lanes)
 
-    def splats(self, lanes: Lanes, block):
+    def splats(self, planes, block, lanes: Lanes):
         """Read a block's splats, `[lanes, slots]` each, placed relative to their tile's corner."""
-        x, y, *rest = (lanes.read(plane, block) for plane in self.planes)
+        x, y, *rest = (lanes.read(plane, block) for plane in planes)
         return x - lanes.x, y - lanes.y, *rest
 
     def fragments(self, splats):
         """Compute nearness and quadric of a block's fragments, `[lanes, slots, pixels]`."""
         x, y, sx, sy, a, b, c, e = (p[:, :, None] for p in splats[:8])
-        px, py = (jnp.asarray(p)[None, None] for p in self.pixels())
+        px, py = (jnp.asarray(p)[None, None] for p in self.pixels(x.dtype))
         dx, dy = px - x, py - y
         return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy
 
-    def weigh(self, lanes: Lanes, block, far_limit, near_limit):
-        """Weigh the fragments of a block between two limits, `far_limit < nearness <= near_limit`.
+    def limits(self, slots: "Slots", lanes: Lanes):
+        """Find per pixel the nearest shifted fragment: the far limit of the front."""
 
-        **Returns:** the splats, nearness and quadric, and `rho^2` and the weight without opacity;
-        of all other fragments these are 1 and 0.
-        """
-        splats = self.splats(lanes, block)
-        nearness, quadric = self.fragments(splats)
-        # Without those of lanes whose list has ended.
-        far_limit = jnp.where((block < lanes.lengths)[:, None], far_limit, jnp.inf)
-        between = (nearness > far_limit[:, None]) & (nearness <= near_limit[:, None])
-        chosen = self.view_class.inside(nearness, quadric) & between
-        squared_radius = self.view_class.squared_radius(nearness, quadric)
-        squared_radius = jnp.where(chosen, squared_radius, 1.0)
-        return splats, nearness, quadric, squared_radius, fast_fragment_weight(squared_radius)
+        # These lanes are one chunk: their lists have equal length, so none ends early.
+        def nearest(block, limit):
+            nearness, quadric = self.fragments(self.splats(slots.planes, block, lanes))
+            shifted = self.view_class.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
+            return jnp.maximum(
+                limit,
+                jnp.max(
+                    jnp.where(self.view_class.inside(nearness, quadric), shifted, -jnp.inf), axis=1
+                ),
+            )
 
-    def _nearest(self, lanes: Lanes, block, nearness, chosen, limit):
-        """Move a limit to the nearest shifted one of the chosen fragments of a block."""
-        shifted = self.view_class.shifted(nearness, lanes.read(self.shift, block)[:, :, None])
-        return jnp.maximum(limit, jnp.max(jnp.where(chosen, shifted, -jnp.inf), axis=1))
+        return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._no_limit(lanes))
 
-    def limits(self, lanes: Lanes):
-        """Find per pixel the nearest shifted fragment: the far limit of the front, -inf without
-        one. The lanes are one chunk: their lists have equal length.
-        """
-
-        def step(block, limit):
-            nearness, quadric = self.fragments(self.splats(lanes, block))
-            inside = self.view_class.inside(nearness, quadric)
-            return self._nearest(lanes, block, nearness, inside, limit)
-
-        none = jnp.full((len(lanes.row), TILE_SIDE**2), -jnp.inf, self.shift.dtype)
-        return lax.fori_loop(jnp.int32(0), lanes.blocks, step, none)
-
-    def limits_behind(self, lanes: Lanes, open_limit):
+    def limits_behind(self, slots: "Slots", lanes: Lanes, open_limit):
         """Find the same behind the front, whose far limit is `open_limit` in open pixels and -inf
         in others: for the fragments of sufficient weight, and for all.
         """
-        none = jnp.full_like(open_limit, -jnp.inf)
 
-        def step(block, limits):
-            splats, nearness, _, squared_radius, weight = self.weigh(lanes, block, none, open_limit)
-            least = least_weight(self.view_class, *splats[4:8], self.settings.filter_radius)
-            is_weighty = splats[-1][:, :, None] * weight > least[:, :, None]
-            return tuple(
-                self._nearest(lanes, block, nearness, chosen, limit)
-                for chosen, limit in zip((is_weighty, squared_radius < 1), limits, strict=True)
-            )
+        def nearest(block, limits):
+            splats = self.splats(slots.planes, block, lanes)
+            nearness, quadric = self.fragments(splats)
+            shifted = self.view_class.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
+            far_limit = lanes.until_end(jnp.full_like(open_limit, -jnp.inf), block)
+            squared_radius = self.squared_radii(nearness, quadric, far_limit, open_limit)
+            weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
+            least = least_weight(self.view_class, *splats[4:8], self.filter_radius)
+            chosen = weight > least[:, :, None], squared_radius < 1
+            new = (jnp.max(jnp.where(which, shifted, -jnp.inf), axis=1) for which in chosen)
+            return tuple(jnp.maximum(*pair) for pair in zip(limits, new, strict=True))
 
-        return lax.fori_loop(jnp.int32(0), lanes.blocks, step, (none, none))
+        return lax.fori_loop(
+            jnp.int32(0), lanes.blocks, nearest, (self._no_limit(lanes), self._no_limit(lanes))
+        )
 
-    def rows(self, ids, splats):
+    def _no_limit(self, lanes: Lanes):
+        return jnp.full((lanes.row.shape[0], TILE_SIDE**2), -jnp.inf, lanes.x.dtype)
+
+    def squared_radii(self, nearness, quadric, far_limit, near_limit):
+        """Compute `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0,
+        for all others.
+        """
+        between = (nearness > far_limit[:, None]) & (nearness <= near_limit[:, None])
+        chosen = self.view_class.inside(nearness, quadric) & between
+        return jnp.where(chosen, self.view_class.squared_radius(nearness, quadric), 1.0)
+
+    def rows(self, slots: "Slots", ids, splats):
         """Return `[lanes, slots, rows]`: attributes, the plane of nearness over the tile (three
         rows) and 1.
         """
-        attributes = self.attributes.at[ids].get(mode="fill", fill_value=0)
-        nearness, _ = _polynomials(*splats[:-1])
-        return jnp.concatenate([attributes, nearness, jnp.ones_like(nearness[:, :, :1])], axis=2)
+        x, y, sx, sy, _, _, _, e, _ = splats
+        nearness = jnp.stack([e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=2)
+        attributes = slots.attributes.at[ids].get(mode="fill", fill_value=0)
+        return jnp.concatenate([attributes, nearness], axis=2)
 
-    def sums(self, lanes: Lanes, far_limit, near_limit) -> PixelSums:
+    def sums(self, slots: "Slots", lanes: Lanes, far_limit, near_limit) -> PixelSums:
         """Sum over the fragments between two limits."""
 
         def add(block, sums):
-            splats, *_, weight = self.weigh(lanes, block, far_limit, near_limit)
-            rows = self.rows(lanes.read(self.ids, block), splats)
+            splats = self.splats(slots.planes, block, lanes)
+            squared_radius = self.squared_radii(
+                *self.fragments(splats), lanes.until_end(far_limit, block), near_limit
+            )
+            weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
+            rows = self.rows(slots, lanes.read(slots.ids, block), splats)
             # The transpose in memory costs less than it saves in the product.
             rows = lax.optimization_barrier(jnp.swapaxes(rows, 1, 2))
-            return sums + jnp.einsum("trs,tsp->trp", rows, splats[-1][:, :, None] * weight)
+            return sums + jnp.einsum("trs,tsp->trp", rows, weight)
 
-        (places, pixels), rows = far_limit.shape, self.attributes.shape[1]
+        (places, pixels), rows = far_limit.shape, slots.attributes.shape[1]
         start = jnp.zeros((places, rows + 4, pixels), far_limit.dtype)
         sums = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
         attributes, nearness = sums[:, :rows], sums[:, rows:]
-        px, py = self.pixels()
+        px, py = self.pixels(far_limit.dtype)
         plane = nearness[:, 0] + nearness[:, 1] * px[None] + nearness[:, 2] * py[None]
         return PixelSums(jnp.concatenate([attributes, plane[:, None]], axis=1), nearness[:, 3])
 
-    def add_cotangents(self, lanes: Lanes, far_limit, near_limit, cotangent: PixelSums, gradients):
+    def add_cotangents(
+        self,
+        slots: "Slots",
+        lanes: Lanes,
+        far_limit,
+        near_limit,
+        cotangent: PixelSums,
+        gradients,
+    ):
         """Add the cotangents of planes, per slot, and of attributes, per splat, for the fragments
         between two limits, from those of the sums.
         """
-        px, py = self.pixels()
+        px, py = self.pixels(far_limit.dtype)
         monomials = jnp.asarray(
             np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
         )
-        count, of_nearness = self.attributes.shape[1], cotangent.rows[:, -1:]
+        count, of_nearness = slots.attributes.shape[1], cotangent.rows[:, -1:]
         of_plane = [of_nearness * px[None, None], of_nearness * py[None, None]]
         of_weights = cotangent.weights[:, None]
         of_rows = jnp.concatenate([cotangent.rows, *of_plane, of_weights], axis=1)
 
         def add(block, gradients):
-            splats, nearness, quadric, squared_radius, weight = self.weigh(
-                lanes, block, far_limit, near_limit
+            splats = self.splats(slots.planes, block, lanes)
+            nearness, quadric = self.fragments(splats)
+            squared_radius = self.squared_radii(
+                nearness, quadric, lanes.until_end(far_limit, block), near_limit
             )
-            ids, opacity = lanes.read(self.ids, block), splats[-1]
-            rows = self.rows(ids, splats)
+            weight = fast_fragment_weight(squared_radius)
+            ids, opacity = lanes.read(slots.ids, block), splats[-1]
+            rows = self.rows(slots, ids, splats)
             # Cotangents of the summed rows, per slot, for a weight without opacity.
             d_rows = jnp.einsum("tsp,trp->tsr", weight, of_rows)
             d_opacity = jnp.sum(rows * d_rows, axis=2)
@@ -225,29 +231,78 @@ class Sweep(eqx.Module):
             d_weight = opacity[:, :, None] * jnp.einsum("tsr,trp->tsp", rows, of_rows)
             d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
             nearness = jnp.where(squared_radius < 1, nearness, 1.0)
-            _, pull = jax.vjp(self.view_class.squared_radius, nearness, quadric)
-            d_nearness, d_quadric = pull(d_squared)
-            # Both are polynomials in the pixel: their moments over the tile suffice.
-            d_rows = d_rows * opacity[:, :, None]
-            moments = d_nearness @ monomials[:, :3] + d_rows[:, :, count : count + 3]
-            _, pull = jax.vjp(_polynomials, *splats[:-1])
-            d_planes = *pull((moments, d_quadric @ monomials)), d_opacity
-            of_planes, of_attributes = gradients
-            at = lanes.row + block * lanes.stride
-            of_planes = tuple(
-                total.at[at].add(new, mode="promise_in_bounds")
-                for total, new in zip(of_planes, d_planes, strict=True)
+            d_nearness, d_quadric = self.view_class.squared_radius_vjp(
+                nearness, squared_radius, d_squared
             )
-            return of_planes, of_attributes.at[ids].add(d_rows[:, :, :count], mode="drop")
+            # Both are polynomials in the pixel: their moments over the tile suffice.
+            quad = jnp.moveaxis(d_quadric @ monomials, 2, 0)
+            near = jnp.moveaxis(d_nearness @ monomials[:, :3], 2, 0)
+            d_rows = d_rows * opacity[:, :, None]
+            near = near + jnp.moveaxis(d_rows[:, :, count : count + 3], 2, 0)
+            of_planes, of_attributes = gradients
+            d_planes = *_plane_cotangents(splats, quad, near), d_opacity
+            return (
+                tuple(
+                    lanes.add(total, block, new)
+                    for total, new in zip(of_planes, d_planes, strict=True)
+                ),
+                of_attributes.at[ids].add(d_rows[:, :, :count], mode="drop"),
+            )
 
         return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)
 
 
-def _polynomials(x, y, sx, sy, a, b, c, e):
-    """Compute the coefficients of nearness and quadric as polynomials in the pixel: of 1, x, y,
-    and of 1, x, y, x^2, x y, y^2.
+class Slots(eqx.Module):
+    """The input of the sweeps: planes gathered into slots, in rows of one lane each, and attributes
+    per splat, which are too many for slots.
     """
-    nearness = e - sx * x - sy * y, sx, sy
-    constant = a * x * x + b * x * y + c * y * y
-    quadric = constant, -(2 * a * x + b * y), -(b * x + 2 * c * y), a, b, c
-    return jnp.stack(nearness, axis=2), jnp.stack(quadric, axis=2)
+
+    ids: Int[Array, "rows slots"]
+    planes: list[Float[Array, "rows slots"]]
+    shift: Float[Array, "rows slots"]
+    attributes: Float[Array, "splats attributes"]
+
+    @classmethod
+    def gathered(
+        cls,
+        shift: Float[Array, " splats"],
+        planes: tuple[Float[Array, " splats"], ...],
+        attributes: Float[Array, "splats attributes"],
+        bins: Bins,
+    ) -> "Slots":
+        """Gather splats into the slots of the bins."""
+        width = bins.ids.shape[2]
+
+        def slots(plane, fill):
+            return slot_plane(plane, fill, bins).reshape(-1, width)
+
+        return cls(
+            ids=bins.ids.reshape(-1, width),
+            planes=[slots(plane, fill) for plane, fill in zip(planes, _EMPTY, strict=True)],
+            shift=slots(shift, 0.0),
+            attributes=attributes,
+        )
+
+
+def _plane_cotangents(splats, quad, near):
+    """Convert moments of the cotangents over the pixels to cotangents of a splat's numbers."""
+    x, y, sx, sy, a, b, c, _, _ = splats
+    m, mx, my, mxx, mxy, myy = quad
+    n, nx, ny = near
+    dx, dy = mx - x * m, my - y * m
+    dxx = mxx - 2 * x * mx + x * x * m
+    dxy = mxy - x * my - y * mx + x * y * m
+    dyy = myy - 2 * y * my + y * y * m
+    d_x = -(2 * a * dx + b * dy + sx * n)
+    d_y = -(b * dx + 2 * c * dy + sy * n)
+    return d_x, d_y, nx - x * n, ny - y * n, dxx, dxy, dyy, n
+
+
+def second_limits(
+    weighty: Float[Array, "places pixels"], of_any: Float[Array, "places pixels"]
+) -> Float[Array, "places pixels"]:
+    """Choose the end of the surface behind, from the largest of both over all parts; inf where
+    there is none.
+    """
+    limits = jnp.where(weighty > -jnp.inf, weighty, of_any)
+    return jnp.where(limits > -jnp.inf, limits, jnp.inf)

@@ -1,7 +1,5 @@
 """Views of cameras and near lights (perspective), and of distant lights (orthographic)."""
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 from jax.lax import stop_gradient
@@ -11,6 +9,7 @@ from splatjax.scene import Camera, Splats
 
 from ._views import (
     EDGE_ON,
+    MARGIN,
     AbstractView,
     Footprints,
     SplattingSettings,
@@ -49,13 +48,16 @@ class PerspectiveView(AbstractView):
 
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
         px, py, pz = rotate(self.rotation, (splats.centers - self.position[None]).T)
-        in_sight = self.in_sight(px, py, pz, splats.radii)
+        in_sight = self._in_sight(px, py, pz, splats.radii)
         pz = jnp.where(in_sight, pz, 1.0)
         u, v, scale = px / pz, py / pz, self.focal_length / pz
         # All below is homogeneous in the normal and the radius r (pixels), so the normal n is
         # scaled to this length.
-        radius = splats.radii * scale
-        nx, ny, nz = (radius * n for n in rotate(self.rotation, splats.normals.T))
+        radius = splats.radii * self.focal_length / pz
+        nx, ny, nz = (
+            n * splats.radii * self.focal_length / pz
+            for n in rotate(self.rotation, splats.normals.T)
+        )
         # r times the cosine to the line of sight, times the length of (u, v, 1).
         facing = -(nx * u + ny * v + nz)
         visible = in_sight & (facing > EDGE_ON * radius)
@@ -94,10 +96,8 @@ class PerspectiveView(AbstractView):
         x, y = middle_x + self.focal_length * u, middle_y + self.focal_length * v
         mid_x, mid_y = stop_gradient(s_gx / kappa), stop_gradient(s_gy / kappa)
         squared_x, squared_y = (xx + s_gx * mid_x) / kappa, (yy + s_gy * mid_y) / kappa
-        half_x, half_y = (
-            stop_gradient(jnp.sqrt(jnp.where(bounded, squared, jnp.inf)))
-            for squared in (squared_x, squared_y)
-        )
+        half_x = stop_gradient(jnp.sqrt(jnp.where(bounded, squared_x, jnp.inf)))
+        half_y = stop_gradient(jnp.sqrt(jnp.where(bounded, squared_y, jnp.inf)))
         cosine = facing / (radius * jnp.sqrt(1 + u * u + v * v))
         epsilon = epsilon_of(splats.radii, settings.filter_radius / scale, cosine, settings)
         return Footprints(
@@ -120,6 +120,30 @@ class PerspectiveView(AbstractView):
             visible=visible,
         )
 
+    def may_see(self, splats):
+        px, py, pz = rotate(self.rotation, (splats.centers - self.position[None]).T)
+        nx, ny, nz = rotate(self.rotation, splats.normals.T)
+        return self._in_sight(px, py, pz, splats.radii) & (nx * px + ny * py + nz * pz < 0)
+
+    def _in_sight(self, x, y, z, radii):
+        """Mark the spheres that touch the pyramid of the picture. Float32 cannot project others far
+        to the side.
+        """
+
+        def beside(offset, size, middle):
+            half = MARGIN + (
+                0.5 * size
+                if self.principal_pixel is None
+                else jnp.where(offset > 0, size - middle, middle)
+            )
+            return jnp.abs(offset) * self.focal_length - z * half < radii * jnp.sqrt(
+                self.focal_length**2 + half**2
+            )
+
+        middle_x, middle_y = self.axis_pixel
+        beside_x, beside_y = beside(x, self.width, middle_x), beside(y, self.height, middle_y)
+        return (z > self.near) & beside_x & beside_y
+
     @staticmethod
     def inside(nearness, quadric):
         return (quadric < nearness * nearness) & (nearness > 0)
@@ -129,6 +153,11 @@ class PerspectiveView(AbstractView):
         return quadric / (nearness * nearness)
 
     @staticmethod
+    def squared_radius_vjp(nearness, squared_radius, cotangent):
+        z = 1 / nearness
+        return -2 * cotangent * squared_radius * z, cotangent * z * z
+
+    @staticmethod
     def shifted(nearness, shift):
         return nearness * shift
 
@@ -136,8 +165,25 @@ class PerspectiveView(AbstractView):
     def depth(nearness):
         return 1 / nearness
 
+    def depth_slope(self, x, y, depth, normals):
+        nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
+        u, v = self._slopes(x, y)
+        mm = self.pixel_size(depth)
+        return nx * mm, ny * mm, -(nz + nx * u + ny * v)
+
+    def _slopes(self, x, y):
+        middle_x, middle_y = self.axis_pixel
+        return (x - middle_x) / self.focal_length, (y - middle_y) / self.focal_length
+
     def pixel_size(self, depth):
-        return depth / self.focal_length
+        return jnp.where(depth > self.near, depth, 1.0) / self.focal_length
+
+    def unproject(self, x, y, depth):
+        u, v = self._slopes(x, y)
+        along = jnp.stack([u * depth, v * depth, depth])
+        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
+            3, *[1] * depth.ndim
+        )
 
 
 class OrthographicView(AbstractView):
@@ -148,7 +194,6 @@ class OrthographicView(AbstractView):
     scale: Float[Array, ""]
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
-    near: float = eqx.field(static=True, default=-math.inf)
 
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
         px, py, pz = rotate(self.rotation, (splats.centers - self.position[None]).T)
@@ -184,6 +229,16 @@ class OrthographicView(AbstractView):
             visible=visible,
         )
 
+    def may_see(self, splats):
+        x, y, _ = rotate(self.rotation, (splats.centers - self.position[None]).T)
+        _, _, facing = rotate(self.rotation, splats.normals.T)
+        inside_x = jnp.abs(x) < 0.5 * (self.width + 2 * MARGIN) / self.scale + splats.radii
+        return (
+            inside_x
+            & (jnp.abs(y) < 0.5 * (self.height + 2 * MARGIN) / self.scale + splats.radii)
+            & (facing < 0)
+        )
+
     @staticmethod
     def inside(nearness, quadric):
         return quadric < 1
@@ -193,6 +248,10 @@ class OrthographicView(AbstractView):
         return quadric
 
     @staticmethod
+    def squared_radius_vjp(nearness, squared_radius, cotangent):
+        return jnp.zeros_like(nearness), cotangent
+
+    @staticmethod
     def shifted(nearness, shift):
         return nearness - shift
 
@@ -200,5 +259,17 @@ class OrthographicView(AbstractView):
     def depth(nearness):
         return -nearness
 
+    def depth_slope(self, x, y, depth, normals):
+        nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
+        return nx / self.scale, ny / self.scale, -nz
+
     def pixel_size(self, depth):
         return 1 / self.scale
+
+    def unproject(self, x, y, depth):
+        along = jnp.stack(
+            [(x - self.width / 2) / self.scale, (y - self.height / 2) / self.scale, depth]
+        )
+        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
+            3, *[1] * depth.ndim
+        )

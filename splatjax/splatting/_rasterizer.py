@@ -1,5 +1,5 @@
 """Rasterizers: the weight of a fragment (Eq. 1), and sums of attributes over the front surface and
-the one right behind it. The plain rasterizer is the reference, and supports every derivative.
+the one right behind it.
 """
 
 import abc
@@ -7,15 +7,13 @@ import math
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from splatjax._combination import AbstractCombination
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats
 
-from ._bins import TileGrid
 from ._views import AbstractView, SplattingSettings
 
 _AT_RIM = math.exp(-4.0)
@@ -215,75 +213,3 @@ class AbstractRasterizer(eqx.Module):
     def for_shadows(self) -> "AbstractRasterizer":
         """Return the rasterizer of the shadow maps: itself, unless it supports only pictures."""
         return self
-
-
-class DenseRasterizer(AbstractRasterizer):
-    """Evaluates every splat at every pixel. Slow; supports forward mode and second order."""
-
-    def make_plan(self, parts, views, settings):
-        if len(parts) > 1:
-            raise ValueError("a DenseRasterizer works on one device; give a TileRasterizer")
-        return DenseRasterPlan()
-
-
-class DenseRasterPlan(AbstractRasterPlan):
-    """The plan of the plain rasterizer, which needs no capacity."""
-
-    def sum_fragments(
-        self,
-        splats: Splats,
-        attributes: Float[Array, "attributes splats"],
-        view: AbstractView,
-        settings: SplattingSettings,
-        combination: AbstractCombination,
-    ) -> FragmentSums:
-        dtype, footprints = attributes.dtype, view.footprints(splats, settings)
-        grid = TileGrid(view.width, view.height)
-        # The least weight of a fragment that determines the surface behind the front.
-        conic = footprints.a, footprints.b, footprints.c, footprints.nearness
-        least = jax.lax.stop_gradient(least_weight(type(view), *conic, settings.filter_radius))
-
-        def in_tile(tile: Int[Array, ""]):
-            # Intersect the ray of every pixel with the plane of every splat: nearness and rho^2 are
-            # polynomials in the offset from the projected center.
-            x, y = (pixel.T.astype(dtype) + 0.5 for pixel in grid.columns_and_rows(tile[None]))
-            dx, dy = x - footprints.x[None], y - footprints.y[None]
-            slope = footprints.slope_x[None] * dx + footprints.slope_y[None] * dy
-            nearness = footprints.nearness[None] + slope
-            quadric = dx * (footprints.a[None] * dx + footprints.b[None] * dy)
-            quadric = quadric + footprints.c[None] * dy * dy
-            # Weigh the fragments: hits within the rim (Eq. 1's w_i).
-            inside = footprints.visible[None] & view.inside(nearness, quadric)
-            squared_radius = jnp.where(
-                inside, view.squared_radius(jnp.where(inside, nearness, 1.0), quadric), 1.0
-            )
-            weight = footprints.opacity[None] * fragment_weight(squared_radius)
-            weight = jnp.where(inside, weight, 0.0)
-            # Move every fragment away from the eye by epsilon (3.1).
-            shifted = view.shifted(nearness, footprints.shift[None])
-
-            def nearest(chosen: Bool[Array, "pixels splats"]) -> Float[Array, " pixels"]:
-                return jnp.max(jnp.where(chosen, shifted, -jnp.inf), axis=1)
-
-            def summed(chosen: Bool[Array, "pixels splats"]) -> Float[Array, "rows pixels"]:
-                weights, hits = jnp.where(chosen, weight, 0.0), jnp.where(chosen, nearness, 0.0)
-                last = jnp.stack([jnp.sum(weights * hits, axis=1), jnp.sum(weights, axis=1)])
-                return jnp.concatenate([attributes @ weights.T, last])
-
-            # The front: fragments nearer than the nearest shifted one.
-            front = inside & (nearness > nearest(inside)[:, None])
-            in_front = summed(front)
-            # Behind it, in pixels that it leaves open: the same among all others, from the nearest
-            # that weighs something.
-            is_open = jax.lax.stop_gradient(in_front[-1]) < settings.full_coverage
-            rest = inside & ~front & is_open[:, None]
-            weighty = nearest(rest & (weight > least[None]))
-            limit = jnp.where(weighty > -jnp.inf, weighty, nearest(rest))
-            return in_front, summed(rest & (nearness > limit[:, None]))
-
-        tiles = jnp.arange(grid.count, dtype=jnp.int32)
-        rows = jnp.concatenate(jax.lax.map(in_tile, tiles))
-        tiles = jnp.tile(tiles, 2)
-        rows = jnp.where(grid.within_picture(tiles)[:, None], rows, 0.0)
-        sums = PixelSums(rows[:, :-1], rows[:, -1])
-        return FragmentSums(tiles, sums, jnp.zeros((), dtype), grid.count)

@@ -13,7 +13,7 @@ from splatjax._combination import AbstractCombination, extreme
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats, rotation_towards
 
-from ._bins import TILE_SIDE, TileGrid
+from ._grid import TILE_SIDE, TileGrid
 from ._groups import MERGED_COUNTS
 from ._projections import OrthographicView, PerspectiveView
 from ._rasterizer import AbstractRasterPlan, FragmentSums, coverage, invalid_factor
@@ -80,9 +80,8 @@ class Bounds(eqx.Module):
         )
         center = 0.5 * (low + high)
         offset = splats.centers - center[None]
-        squared = extreme(
-            jnp.where(exists, jnp.sum(offset * offset, axis=1), -jnp.inf), combination
-        )
+        squared = jnp.where(exists, jnp.sum(offset * offset, axis=1), -jnp.inf)
+        squared = extreme(squared, combination)
         apart = squared > 0  # a single splat lies in its center, wherever it moves
         reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)
         radius = reach + extreme(splats.radii, combination)

@@ -11,7 +11,7 @@ from splatjax._chunking import AT_ONCE, zeros_after
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._bins import TILE_SIDE, TileGrid
+from ._grid import TILE_SIDE, TileGrid
 from ._rasterizer import AbstractRasterPlan, FragmentSums, PixelSums, coverage, invalid_factor
 from ._views import AbstractView, SplattingSettings
 

@@ -19,10 +19,10 @@ from splatjax._chunking import jit_unless_traced, needed_over_planned, zeros_aft
 from splatjax._combination import AbstractCombination
 from splatjax._precision import full_precision
 
-from ._bins import TILE_SIDE, Bins, TileGrid
-from ._fragments import Lanes, Sweep
+from ._bins import Bins, scatter_slots
+from ._fragments import Lanes, Slots, Sweep, second_limits
+from ._grid import TILE_SIDE
 from ._rasterizer import FragmentSums, PixelSums, SurfaceCapacity
-from ._views import AbstractView, SplattingSettings
 
 
 class Spans(eqx.Module):
@@ -32,155 +32,177 @@ class Spans(eqx.Module):
     **Attributes:**
 
     - `tiles`: the tile at each place; the number of tiles in an empty place.
-    - `far_limit`, `near_limit`: nearness. Both are -inf in pixels without fragments.
+    - `far_limit`, `near_limit`: nearness. `far_limit` is inf without fragments.
+    - `needed`: places needed over planned.
     """
 
     tiles: Int[Array, " places"]
     far_limit: Float[Array, "places pixels"]
     near_limit: Float[Array, "places pixels"]
+    needed: Float[Array, ""]
 
     @classmethod
     def front(
         cls, limits: Float[Array, "tiles pixels"], lengths: Int[Array, " tiles"], size: int
-    ) -> tuple["Spans", Float[Array, ""]]:
-        """Choose the places of the front, and compute the places needed over planned. Longer lists
-        come first, so that tiles that are swept together have lists of similar length.
+    ) -> "Spans":
+        """Choose the places of the front. Longer lists come first, so that tiles that are swept
+        together have lists of similar length.
         """
         order = jnp.argsort(-lengths)
         shown = jnp.any(limits > -jnp.inf, axis=1)
         tiles = _taken(order.astype(jnp.int32), _listed(shown[order], size), len(order))
-        far_limit = _taken(limits, tiles, -jnp.inf)
-        near_limit = jnp.where(far_limit > -jnp.inf, jnp.inf, far_limit)
-        return cls(tiles, far_limit, near_limit), needed_over_planned(jnp.sum(shown), size)
+        far_limit = _taken(limits, tiles, jnp.inf)
+        far_limit = jnp.where(far_limit > -jnp.inf, far_limit, jnp.inf)
+        needed = needed_over_planned(jnp.sum(shown), size).astype(limits.dtype)
+        return cls(tiles, far_limit, jnp.full_like(far_limit, jnp.inf), needed)
 
     def opened(self, is_open: Bool[Array, "places pixels"], size: int, none: int):
         """Choose the places with pixels that the front leaves open.
 
-        **Returns:** their tiles, the near limit of the surface behind in open pixels, -inf in
-        others, and the places needed over planned.
+        Returns their tiles, the near limit of the surface behind, the same in open pixels and -inf
+        in others, and the places needed over planned.
         """
-        open_limit = jnp.where(is_open, self.far_limit, -jnp.inf)
-        chosen = jnp.any(open_limit > -jnp.inf, axis=1)
-        listed, needed = _listed(chosen, size), needed_over_planned(jnp.sum(chosen), size)
-        return _taken(self.tiles, listed, none), _taken(open_limit, listed, -jnp.inf), needed
+        is_open &= self.far_limit < jnp.inf
+        chosen = jnp.any(is_open, axis=1)
+        listed = _listed(chosen, size)
+        near_limit = _taken(self.far_limit, listed, -jnp.inf)
+        open_limit = jnp.where(_taken(is_open, listed, False), near_limit, -jnp.inf)
+        needed = needed_over_planned(jnp.sum(chosen), size).astype(near_limit.dtype)
+        return _taken(self.tiles, listed, none), near_limit, open_limit, needed
+
+    def followed_by(self, behind: "Spans") -> "Spans":
+        """Append the places of the surface behind."""
+        return Spans(
+            tiles=jnp.concatenate([self.tiles, behind.tiles]),
+            far_limit=jnp.concatenate([self.far_limit, behind.far_limit]),
+            near_limit=jnp.concatenate([self.near_limit, behind.near_limit]),
+            needed=jnp.maximum(self.needed, behind.needed),
+        )
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2, 3, 4))
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
 def sum_tile_fragments(
+    sweep: Sweep,
     capacity: SurfaceCapacity,
     combination: AbstractCombination,
-    view_class: type[AbstractView],
-    grid: TileGrid,
-    settings: SplattingSettings,
     bins: Bins,
     shift: Float[Array, " splats"],
     planes: tuple[Float[Array, " splats"], ...],
     attributes: Float[Array, "splats attributes"],
 ) -> FragmentSums:
-    """Sum attributes over the splats of every tile: this device's part of the sums.
-
-    **Arguments:** `view_class` and all after it as for `Sweep.of`.
-    """
-    kind = view_class, grid, settings
-    return _sum_fwd(capacity, combination, *kind, bins, shift, planes, attributes)[0]
+    """Sum attributes over the splats of every tile: this device's part of the sums."""
+    return _sum_fwd(sweep, capacity, combination, bins, shift, planes, attributes)[0]
 
 
-def _sum_fwd(capacity, combination, *given):
-    sweep = Sweep.of(*given)
-    ((sums, spans),) = sum_parts(lambda: [[sweep]], [capacity], combination)
-    return sums, (given[3:], spans)
+def _sum_fwd(sweep, capacity, combination, bins, shift, planes, attributes):
+    part = PartSweep(sweep, bins, Slots.gathered(shift, planes, attributes, bins))
+    ((sums, spans),) = sum_parts(lambda: [[part]], [capacity], combination)
+    return sums, (bins, shift, planes, attributes, spans)
 
 
 @full_precision
-def _sum_bwd(capacity, combination, view_class, grid, settings, residuals, cotangent):
-    (bins, shift, planes, attributes), spans = residuals
-    sweep = Sweep.of(view_class, grid, settings, bins, shift, planes, attributes)
+def _sum_bwd(sweep: Sweep, capacity: SurfaceCapacity, combination, residuals, cotangent):
+    bins, shift, planes, attributes, spans = residuals
+    part = PartSweep(sweep, bins, Slots.gathered(shift, planes, attributes, bins))
     dtype, cotangent = shift.dtype, cotangent.sums
 
     def add(_, *arguments):
-        return sweep.add_cotangents(*arguments)
+        return sweep.add_cotangents(part.slots, *arguments)
 
-    def scattered(slots):
-        return jnp.zeros_like(shift).at[sweep.ids].add(slots, mode="drop")
-
-    of_planes = tuple(zeros_after(cotangent, sweep.shift.shape, dtype) for _ in planes)
+    of_planes = tuple(zeros_after(cotangent, part.slots.shift.shape, dtype) for _ in planes)
     gradients = of_planes, zeros_after(cotangent, attributes.shape, dtype)
     given = spans.far_limit, spans.near_limit, cotangent
-    of_planes, of_rows = each_round(sweep, spans.tiles, given, add, gradients)
-    return None, None, tuple(map(scattered, of_planes)), of_rows
+    of_planes, of_rows = part.each_round(spans.tiles, given, add, gradients)
+    of_splats = (scatter_slots(slots, bins, shift.shape[0]) for slots in of_planes)
+    return None, None, tuple(of_splats), of_rows
 
 
 sum_tile_fragments.defvjp(_sum_fwd, _sum_bwd)
 
 
-@jit_unless_traced
-def front_limits(sweep: Sweep) -> tuple[Float[Array, "tiles pixels"], Int[Array, " tiles"]]:
-    """Compute the end of the front, -inf without one; and the length of each list."""
-    grid, bins, dtype = sweep.grid, sweep.bins, sweep.shift.dtype
-    order = bins.order[: bins.planned_lanes]
-
-    def look(place, lanes: Lanes, limits):
-        return _write(limits, sweep.limits(lanes), place)
-
-    none = zeros_after(sweep.shift, (len(order), TILE_SIDE**2), dtype) - jnp.inf
-    limits = each_round(sweep, order, (), look, none)
-    limits = jnp.where(grid.within_picture(order), limits, -jnp.inf)
-    every = jnp.full((grid.count, TILE_SIDE**2), -jnp.inf, dtype)
-    lengths = jnp.repeat(jnp.diff(bins.first_block), grid.lanes)
-    lengths = jnp.zeros(grid.count, jnp.int32).at[bins.order].set(lengths, mode="drop")
-    return every.at[order].set(limits, mode="drop"), lengths
-
-
-@jit_unless_traced
-def add_sums(sweep: Sweep, spans: Spans, so_far: PixelSums, first: int) -> PixelSums:
-    """Add the sums over the fragments of some spans to others, from a first place on."""
-
-    def add(place, lanes: Lanes, far_limit, near_limit, so_far):
-        sums = sweep.sums(lanes, far_limit, near_limit)
-        before = _sliced(so_far, first + place, len(far_limit))
-        return _write(so_far, jax.tree.map(jnp.add, before, sums), first + place)
-
-    return each_round(sweep, spans.tiles, (spans.far_limit, spans.near_limit), add, so_far)
-
-
-@jit_unless_traced
-def limits_behind(
-    sweep: Sweep, tiles: Int[Array, " places"], open_limit: Float[Array, "places pixels"]
-) -> tuple[Float[Array, "places pixels"], Float[Array, "places pixels"]]:
-    """Compute the end of the surface behind, for the fragments of sufficient weight and for all;
-    `open_limit` is the end of the front in open pixels, and -inf in others.
+class PartSweep(eqx.Module):
+    """The separate stages of the sweep, for splats that may be one of several parts: splats of
+    another part may be in front.
     """
 
-    def look(place, lanes: Lanes, open_limit, limits):
-        return _write(limits, sweep.limits_behind(lanes, open_limit), place)
+    sweep: Sweep
+    bins: Bins
+    slots: Slots
 
-    none = zeros_after(open_limit, open_limit.shape, open_limit.dtype) - jnp.inf
-    return each_round(sweep, tiles, (open_limit,), look, (none, none))
+    @jit_unless_traced
+    def limits(self) -> tuple[Float[Array, "tiles pixels"], Int[Array, " tiles"]]:
+        """Compute the end of the front, -inf without one; and the length of each list."""
+        grid, order, dtype = self.sweep.grid, self.bins.order, self.slots.shift.dtype
 
+        def chunk(i, limits):
+            lane_numbers = i * grid.lanes + jnp.arange(grid.lanes, dtype=jnp.int32)
+            new = self.sweep.limits(self.slots, self.sweep.lanes(self.bins, lane_numbers, dtype))
+            return limits.at[order[lane_numbers]].set(new, mode="drop")
 
-def each_round(sweep: Sweep, tiles: Int[Array, " places"], given, function: Callable, out):
-    """Apply `function(first place, lanes, *given, out)` to the places, as many at a time as there
-    are lanes, up to the last tile.
-    """
-    grid, bins, planned = sweep.grid, sweep.bins, sweep.bins.planned_lanes
-    # The lane of every tile, and of every place; `planned` where the list is empty.
-    of_tile = jnp.full(grid.padded_count + 1, planned, jnp.int32)
-    of_tile = of_tile.at[bins.order[:planned]].set(jnp.arange(planned, dtype=jnp.int32))
-    of_place = of_tile[jnp.where(tiles < grid.count, tiles, grid.padded_count)]
+        limits = zeros_after(self.slots.shift, (grid.count, TILE_SIDE**2), dtype) - jnp.inf
+        limits = jax.lax.fori_loop(jnp.int32(0), self.bins.chunks, chunk, limits)
+        lengths = jnp.repeat(jnp.diff(self.bins.first_block), grid.lanes)
+        return limits, jnp.zeros(grid.count, jnp.int32).at[order].set(lengths, mode="drop")
 
-    def step(i, out):
-        first = i * grid.lanes
-        lane_numbers, *arguments = _sliced((of_place, *given), first, grid.lanes)
-        return function(first, sweep.lanes(lane_numbers), *arguments, out)
+    def empty_sums(self, front: Spans, capacity: SurfaceCapacity) -> PixelSums:
+        """Return sums over no fragments, for the places of both surfaces."""
+        places, attributes = capacity.front + capacity.behind, self.slots.attributes
+        known, dtype = (front.far_limit, attributes), front.far_limit.dtype
+        rows = zeros_after(known, (places, attributes.shape[1] + 1, TILE_SIDE**2), dtype)
+        return PixelSums(rows, zeros_after(known, (places, TILE_SIDE**2), dtype))
 
-    ends = jnp.arange(1, len(tiles) + 1, dtype=jnp.int32)
-    last = jnp.max(jnp.where(tiles < grid.count, ends, 0), initial=0)
-    rounds = -(-last // grid.lanes)
-    return jax.lax.fori_loop(jnp.zeros_like(rounds), rounds, step, out)
+    @jit_unless_traced
+    def add_sums(self, spans: Spans, so_far: PixelSums, first: int) -> PixelSums:
+        """Add the sums over the fragments of some spans to others, from a first place on."""
+
+        def add(i, lanes: Lanes, far_limit, near_limit, tiles, so_far):
+            sums = self.sweep.within_picture(
+                self.sweep.sums(self.slots, lanes, far_limit, near_limit), tiles
+            )
+            before = _sliced(so_far, first + i, len(tiles))
+            return _write(so_far, jax.tree.map(jnp.add, before, sums), first + i)
+
+        given = spans.far_limit, spans.near_limit, spans.tiles
+        return self.each_round(spans.tiles, given, add, so_far)
+
+    @jit_unless_traced
+    def limits_behind(
+        self, tiles: Int[Array, " places"], open_limit: Float[Array, "places pixels"]
+    ) -> tuple[Float[Array, "places pixels"], Float[Array, "places pixels"]]:
+        """Compute the end of the surface behind, for the fragments of sufficient weight and for
+        all; `open_limit` is the end of the front in open pixels, and -inf in others.
+        """
+
+        def look(i, lanes: Lanes, open_limit, limits):
+            return _write(limits, self.sweep.limits_behind(self.slots, lanes, open_limit), i)
+
+        none = zeros_after(open_limit, open_limit.shape, open_limit.dtype) - jnp.inf
+        return self.each_round(tiles, (open_limit,), look, (none, none))
+
+    def each_round(self, tiles: Int[Array, " places"], given, function: Callable, out):
+        """Apply `function(first place, lanes, *given, out)` to the places, as many at a time as
+        there are lanes, up to the last tile.
+        """
+        grid, bins, dtype = self.sweep.grid, self.bins, self.slots.shift.dtype
+        planned = bins.planned_lanes
+        # The lane of every tile, and of every place; `planned` where the list is empty.
+        of_tile = jnp.full(grid.padded_count + 1, planned, jnp.int32)
+        of_tile = of_tile.at[bins.order[:planned]].set(jnp.arange(planned, dtype=jnp.int32))
+        of_place = of_tile[jnp.where(tiles < grid.count, tiles, grid.padded_count)]
+
+        def step(i, out):
+            first = i * grid.lanes
+            lane_numbers, *arguments = _sliced((of_place, *given), first, grid.lanes)
+            return function(first, self.sweep.lanes(bins, lane_numbers, dtype), *arguments, out)
+
+        ends = jnp.arange(1, len(tiles) + 1, dtype=jnp.int32)
+        last = jnp.max(jnp.where(tiles < grid.count, ends, 0), initial=0)
+        rounds = -(-last // grid.lanes)
+        return jax.lax.fori_loop(jnp.zeros_like(rounds), rounds, step, out)
 
 
 def sum_parts(
-    parts: Callable[[], Iterable[Sequence[Sweep]]],
+    parts: Callable[[], Iterable[Sequence[PartSweep]]],
     capacities: Sequence[SurfaceCapacity],
     combination: AbstractCombination,
 ) -> list[tuple[FragmentSums, Spans]]:
@@ -195,55 +217,44 @@ def sum_parts(
     """
     first, views = next(iter(parts())), range(len(capacities))  # by their numbers
     # Stage 1: the end of the front over all parts.
-    limits = combination.largest([front_limits(sweep) for sweep in part] for part in parts())
+    limits = combination.largest([sweep.limits() for sweep in part] for part in parts())
     fronts = [Spans.front(*limits[k], capacities[k].front) for k in views]
 
     # Stage 2: the sums of the front.
     def add_front(sums, part):
-        return [add_sums(part[k], fronts[k][0], sums[k], 0) for k in views]
+        return [part[k].add_sums(fronts[k], sums[k], 0) for k in views]
 
-    empty_sums = [_empty_sums(first[k], fronts[k][0], capacities[k]) for k in views]
+    empty_sums = [first[k].empty_sums(fronts[k], capacities[k]) for k in views]
     sums = combination.fold(add_front, empty_sums, parts())
     # Stage 3: the end of the surface behind, in pixels that the front leaves open.
     weights = combination.total([[sums[k].weights[: capacities[k].front] for k in views]])
-    opened = [
-        front.opened(weight < sweep.settings.full_coverage, capacity.behind, sweep.grid.count)
-        for (front, _), weight, sweep, capacity in zip(
-            fronts, weights, first, capacities, strict=True
-        )
-    ]
+    opened = []
+    for k, capacity in enumerate(capacities):
+        sweep = first[k].sweep
+        is_open = weights[k] < sweep.full_coverage
+        opened.append(fronts[k].opened(is_open, capacity.behind, sweep.grid.count))
+    tiles, near_limits, open_limits, needed = zip(*opened, strict=True)
     limits = combination.largest(
-        [limits_behind(part[k], *opened[k][:2]) for k in views] for part in parts()
+        [part[k].limits_behind(tiles[k], open_limits[k]) for k in views] for part in parts()
     )
 
     # Stage 4: the sums of the surface behind.
-    behind = [
-        Spans(tiles, jnp.where(weighty > -jnp.inf, weighty, of_any), open_limit)
-        for (tiles, open_limit, _), (weighty, of_any) in zip(opened, limits, strict=True)
-    ]
+    far_limits = [second_limits(*limits[k]) for k in views]
+    behind = [Spans(*span) for span in zip(tiles, far_limits, near_limits, needed, strict=True)]
 
     def add_behind(sums, part):
-        return [add_sums(part[k], behind[k], sums[k], capacities[k].front) for k in views]
+        return [part[k].add_sums(behind[k], sums[k], capacities[k].front) for k in views]
 
     sums = combination.fold(add_behind, sums, parts())
     results = []
     for k, capacity in enumerate(capacities):
-        (front, front_needed), (*_, behind_needed) = fronts[k], opened[k]
-        spans = jax.tree.map(lambda *rows: jnp.concatenate(rows), front, behind[k])
-        # Lists only of the first part: a device has one, or it streams parts for which the
-        # capacity of the lists was planned.
-        needed = jnp.stack([front_needed, behind_needed, first[k].bins.needed])
-        needed = combination.largest([jnp.max(needed).astype(spans.far_limit.dtype)])
+        spans = fronts[k].followed_by(behind[k])
+        # Only of the first part: a device has one, or it streams parts for which the capacity of
+        # the lists was planned.
+        lists = first[k].bins.needed.astype(spans.needed.dtype)
+        needed = combination.largest([jnp.maximum(spans.needed, lists)])
         results.append((FragmentSums(spans.tiles, sums[k], needed, capacity.front), spans))
     return results
-
-
-def _empty_sums(sweep: Sweep, front: Spans, capacity: SurfaceCapacity) -> PixelSums:
-    """Return sums over no fragments, for the places of both surfaces."""
-    places, attributes = capacity.front + capacity.behind, sweep.attributes
-    known, dtype = (front.far_limit, attributes), front.far_limit.dtype
-    rows = zeros_after(known, (places, attributes.shape[1] + 1, TILE_SIDE**2), dtype)
-    return PixelSums(rows, zeros_after(known, (places, TILE_SIDE**2), dtype))
 
 
 def _listed(chosen: Bool[Array, " all"], size: int) -> Int[Array, " size"]:

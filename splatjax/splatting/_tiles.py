@@ -16,10 +16,11 @@ from splatjax._precision import full_precision
 from splatjax.cache import reuse_capacity
 from splatjax.scene import Splats
 
-from ._bins import BinCapacity, TileGrid, bin_items
-from ._fragments import PLANES, Sweep
+from ._bins import BinCapacity, bin_items
+from ._fragments import PLANES, Slots, Sweep
+from ._grid import TileGrid
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, SurfaceCapacity
-from ._sweeps import sum_tile_fragments
+from ._sweeps import PartSweep, sum_tile_fragments
 from ._views import AbstractView, SplattingSettings
 
 _STEP = 1024  # of the planned number of splats
@@ -114,11 +115,10 @@ class TilePlan(AbstractRasterPlan):
             plan = self.rasterizer.make_plan([whole], views, settings)
         # Coarse capacities, so that other bodies and pictures of the size share the program.
         grid = self.rasterizer.grid(views[0])
-        most = plan.splats, plan.bins.pairs, plan.bins.blocks
-        seen, pairs, blocks = (1 << count.bit_length() for count in most)
-        bins = BinCapacity(pairs, blocks, grid.padded_count // grid.lanes)
-        places = SurfaceCapacity(grid.padded_count, grid.padded_count)
-        coarse = TilePlan(self.rasterizer, min(seen, whole.count), bins, places)
+        bins = plan.bins.coarse(grid)
+        front = bins.chunks * grid.lanes
+        seen = min(1 << plan.splats.bit_length(), whole.count)
+        coarse = TilePlan(self.rasterizer, seen, bins, SurfaceCapacity(front, front))
         most = max(int(_tiles_behind(whole, view, settings, coarse)) for view in views)
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
@@ -130,9 +130,12 @@ class TilePlan(AbstractRasterPlan):
         self, splats: Splats, view: AbstractView
     ) -> tuple[Int[Array, " chosen"], Float[Array, ""]]:
         may_be_seen = view.may_see(splats)
-        (listed,) = jnp.nonzero(may_be_seen, size=self.splats, fill_value=splats.count)
-        needed = needed_over_planned(jnp.sum(may_be_seen), self.splats)
-        return listed.astype(jnp.int32), needed.astype(splats.centers.dtype)
+        ends = jnp.cumsum(may_be_seen.astype(jnp.int32))
+        every = jnp.arange(splats.count, dtype=jnp.int32)
+        listed = jnp.full(self.splats, splats.count, jnp.int32)
+        listed = listed.at[jnp.where(may_be_seen, ends - 1, self.splats)].set(every, mode="drop")
+        needed = needed_over_planned(ends[-1], self.splats)
+        return listed, needed.astype(splats.centers.dtype)
 
     def sum_fragments(
         self,
@@ -142,8 +145,8 @@ class TilePlan(AbstractRasterPlan):
         settings: SplattingSettings,
         combination: AbstractCombination,
     ) -> FragmentSums:
-        binned = self._bin(splats, attributes, view, settings)
-        return sum_tile_fragments(self.places, combination, *binned)
+        sweep, *binned = self._bin(splats, attributes, view, settings)
+        return sum_tile_fragments(sweep, self.places, combination, *binned)
 
     @full_precision
     @eqx.filter_jit
@@ -153,20 +156,23 @@ class TilePlan(AbstractRasterPlan):
         attributes: Float[Array, "attributes splats"],
         view: AbstractView,
         settings: SplattingSettings,
-    ) -> Sweep:
-        """Prepare the sweep over the splats of one of several parts that the view may see."""
+    ) -> PartSweep:
+        """Prepare the stages of the sweep for those of one of several parts of the splats that the
+        view may see.
+        """
         chosen, _ = self.choose(splats, view)
         seen = splats.take(chosen), take_points(attributes, chosen)
-        return Sweep.of(*self._bin(*seen, view, settings))
+        sweep, bins, *binned = self._bin(*seen, view, settings)
+        return PartSweep(sweep, bins, Slots.gathered(*binned, bins))
 
     def _bin(self, splats: Splats, attributes, view: AbstractView, settings: SplattingSettings):
-        """Project the splats, and list them by tile. Returns the arguments of `Sweep.of`."""
+        """Project the splats, and list them by tile. Returns the input of a sweep: its settings,
+        the lists, and the shifts, planes and attributes of the splats.
+        """
         grid = self.rasterizer.grid(view)
         footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
         return (
-            type(view),
-            grid,
-            settings,
+            Sweep(type(view), grid, settings.full_coverage, settings.filter_radius),
             bin_items(footprints.ranges(grid), grid, self.bins),
             jax.lax.stop_gradient(footprints.shift),
             tuple(getattr(footprints, name) for name in PLANES),

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
 
-from ._bins import TileGrid, TileRanges
+from ._grid import TileGrid, TileRanges
 
 # Cosine to the line of sight, below which float32 cannot determine the visible side of a splat.
 EDGE_ON = 1e-5
@@ -117,29 +117,33 @@ def epsilon_of(radii, filter_radius, cosine, settings: SplattingSettings):
     return settings.epsilon_z * reach / jnp.maximum(cosine, 1 / settings.largest_slope)
 
 
-_MARGIN = 8.0  # pixels around the picture; the screen filter reaches beyond a sphere
+MARGIN = 8.0  # pixels around the picture; the screen filter reaches beyond a sphere
 
 
 class AbstractView(eqx.Module):
-    """A projection of the world onto pixels, whose width grows linearly with depth.
+    """A projection of the world onto pixels.
 
     **Attributes:**
 
     - `position`: mm.
     - `rotation`: world to view; its rows are the right, down and forward axes.
-    - `near`: the least depth that is visible, mm. Static.
     """
 
     position: Float[Array, "3"]
     rotation: Float[Array, "3 3"]
     width: eqx.AbstractVar[int]
     height: eqx.AbstractVar[int]
-    near: eqx.AbstractVar[float]
 
     @abc.abstractmethod
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
         """Project splats. Splats that face away, are edge on, or are before the near plane are not
         visible.
+        """
+
+    @abc.abstractmethod
+    def may_see(self, splats: Splats) -> Bool[Array, " splats"]:
+        """Mark the splats that face the eye and whose spheres touch the picture: a cheap,
+        conservative test.
         """
 
     @staticmethod
@@ -156,6 +160,15 @@ class AbstractView(eqx.Module):
 
     @staticmethod
     @abc.abstractmethod
+    def squared_radius_vjp(
+        nearness: Float[Array, "..."],
+        squared_radius: Float[Array, "..."],
+        cotangent: Float[Array, "..."],
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Compute the cotangents of nearness and quadric for one of `rho^2`."""
+
+    @staticmethod
+    @abc.abstractmethod
     def shifted(nearness: Float[Array, "..."], shift: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute the nearness of a fragment moved away from the eye by epsilon."""
 
@@ -169,56 +182,14 @@ class AbstractView(eqx.Module):
         """Return column and row of the forward axis in the picture."""
         return self.width / 2, self.height / 2
 
-    @abc.abstractmethod
-    def pixel_size(self, depth: Float[Array, "*points"] | float) -> Float[Array, "..."]:
-        """Compute the width of a pixel at a depth, mm."""
-
-    @property
-    def growth(self) -> Float[Array, ""]:
-        """The growth of the width of a pixel per depth; 0 in parallel projection."""
-        return self.pixel_size(1.0) - self.pixel_size(0.0)
-
-    def may_see(self, splats: Splats) -> Bool[Array, " splats"]:
-        """Mark the splats that face the eye and whose spheres touch the picture: a cheap,
-        conservative test.
-        """
-        x, y, z = rotate(self.rotation, (splats.centers - self.position[None]).T)
-        nx, ny, nz = rotate(self.rotation, splats.normals.T)
-        away = self.growth * (nx * x + ny * y) + self.pixel_size(z) * nz
-        return self.in_sight(x, y, z, splats.radii) & (away < 0)
-
-    def in_sight(self, x, y, z, radii) -> Bool[Array, " splats"]:
-        """Mark the spheres that touch the picture's pyramid or prism. Float32 cannot project others
-        far to the side.
-        """
-
-        def beside(offset, size, middle):
-            half = jnp.where(offset > 0, size - middle, middle) + _MARGIN
-            slant = jnp.sqrt(1 + (half * self.growth) ** 2)
-            return jnp.abs(offset) - half * self.pixel_size(z) < slant * radii
-
-        middle_x, middle_y = self.axis_pixel
-        is_beside = beside(x, self.width, middle_x) & beside(y, self.height, middle_y)
-        return (z > self.near) & is_beside
-
     def project(self, points: Float[Array, "3 *points"]) -> tuple[Float[Array, "*points"], ...]:
         """Compute column, row (pixels) and depth (mm) of points."""
         offset = points - self.position.reshape(3, *[1] * (points.ndim - 1))
         x, y, depth = jnp.tensordot(self.rotation, offset, 1)
-        mm = self.pixel_size(jnp.where(depth > self.near, depth, 1.0))
-        middle_x, middle_y = self.axis_pixel
+        mm, (middle_x, middle_y) = self.pixel_size(depth), self.axis_pixel
         return middle_x + x / mm, middle_y + y / mm, depth
 
-    def unproject(
-        self, x: Float[Array, "*points"], y: Float[Array, "*points"], depth: Float[Array, "*points"]
-    ) -> Float[Array, "3 *points"]:
-        """Compute the point in the world at a depth under a pixel."""
-        mm, (middle_x, middle_y) = self.pixel_size(depth), self.axis_pixel
-        along = jnp.stack([(x - middle_x) * mm, (y - middle_y) * mm, depth])
-        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
-            3, *[1] * depth.ndim
-        )
-
+    @abc.abstractmethod
     def depth_slope(
         self,
         x: Float[Array, "*points"],
@@ -232,10 +203,16 @@ class AbstractView(eqx.Module):
 
         `facing` vanishes for a plane seen edge on, so the caller limits it before dividing.
         """
-        nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
-        mm, (middle_x, middle_y) = self.pixel_size(depth), self.axis_pixel
-        slant = nx * (x - middle_x) + ny * (y - middle_y)
-        return nx * mm, ny * mm, -(nz + self.growth * slant)
+
+    @abc.abstractmethod
+    def pixel_size(self, depth: Float[Array, "*points"]) -> Float[Array, "..."]:
+        """Compute the width of a pixel at a depth, mm."""
+
+    @abc.abstractmethod
+    def unproject(
+        self, x: Float[Array, "*points"], y: Float[Array, "*points"], depth: Float[Array, "*points"]
+    ) -> Float[Array, "3 *points"]:
+        """Compute the point in the world at a depth under a pixel."""
 
 
 def rotate(

@@ -21,8 +21,9 @@ from hypothesis.extra.numpy import arrays
 from worlds import FAST, PLAIN, World, named, with_leaf
 
 import splatjax as sj
-from splatjax.diffusion._neighbors import Boxes, find_neighbors
-from splatjax.splatting._bins import BinCapacity, TileGrid
+from splatjax.diffusion._neighbors import Boxes, Neighbors, find_neighbors
+from splatjax.splatting._bins import BinCapacity
+from splatjax.splatting._grid import TileGrid
 from splatjax.splatting._rasterizer import SurfaceCapacity
 from splatjax.splatting._tiles import TilePlan
 
@@ -249,7 +250,11 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             bins, places = BinCapacity(pairs, blocks, chunks), SurfaceCapacity(tiles, tiles)
             return TilePlan(rasterizer, max(shape.splats, 1), bins, places)
         if isinstance(part, sj.diffusion.ClusterPlan):
-            return far_reaching(part)
+            return dataclasses.replace(
+                part,
+                margin=jnp.asarray(jnp.inf, part.margin.dtype),
+                neighbors=far_reaching(part.neighbors),
+            )
         return part
 
     parts = TilePlan | sj.diffusion.ClusterPlan
@@ -259,19 +264,14 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
 FARTHEST = 1e15  # mm, to which all is near
 
 
-def far_reaching(plan: sj.diffusion.ClusterPlan) -> sj.diffusion.ClusterPlan:
+def far_reaching(neighbors: Neighbors) -> Neighbors:
     def anywhere(boxes: Boxes) -> Boxes:
         return Boxes(jnp.full_like(boxes.low, -FARTHEST), jnp.full_like(boxes.high, FARTHEST))
 
-    points, sources = map(anywhere, plan.boxes)
-    far = np.where(np.isfinite(plan.reaches), 10 * FARTHEST, 0.0)
-    return dataclasses.replace(
-        plan,
-        margin=jnp.asarray(jnp.inf, plan.margin.dtype),
-        lists=find_neighbors(points, sources, plan.sources.layers, far.tolist()),
-        boxes=(points, sources),
-        reaches=jnp.full_like(plan.reaches, 10 * FARTHEST),
-    )
+    boxes, reaches = (anywhere(neighbors.points), anywhere(neighbors.sources)), neighbors.reaches
+    far = np.where(np.isfinite(reaches), 10 * FARTHEST, 0.0)
+    lists = find_neighbors(*boxes, np.asarray(neighbors.layers), far.tolist())
+    return Neighbors(lists, *boxes, neighbors.layers, jnp.full_like(reaches, 10 * FARTHEST))
 
 
 def is_finite(shape: Shape, world: World, factors=None) -> bool:

@@ -35,8 +35,9 @@ SETTINGS = SplattingSettings()
 # float64: both do the same sums in another order; 6e-13 and 6e-11 found in 3,000 scenes.
 VALUE, GRADIENT = 1e-10, 1e-8
 # float32: of the largest. A fragment at a limit may fall on either side of it, which moves a pixel
-# by its small weight; all others agree.
-VALUE32, GRADIENT32, OUTLIERS = 2e-4, 2e-3, 0.02
+# by its small weight; all others agree. How sums are rounded depends on the processor: the gradient
+# in the view, a sum over all fragments, is off by 1.9e-3 to 2.4e-3 in one of the scenes.
+VALUE32, GRADIENT32, OUTLIERS = 2e-4, 3e-3, 0.02
 # Of less weight a mean is rounding over rounding: a weight at the rim is a difference of nearly
 # equal numbers.
 MEANINGFUL = 1e-6
