@@ -62,9 +62,10 @@ class ViewOptions:
     #: Rotation of the environment about the vertical axis, degrees; at 0 the middle of the map is
     #: the front (+z).
     environment_rotation: float = 0.0
-    #: Model of the light below the surface: the profile of a flat surface (clusters), or the
-    #: diffusion equation in the closed body, from the coefficients of the material (shape).
-    diffusion: Literal["clusters", "shape"] = "clusters"
+    #: Model of the light below the surface: the profile of a flat surface (clusters); the same in
+    #: less time, with the sum of the layers alone in the EXR (exitance); or the diffusion equation
+    #: in the closed body, from the coefficients of the material (shape).
+    diffusion: Literal["clusters", "exitance", "shape"] = "clusters"
     #: Number of times that light may leave the body and enter it again: 1 or 2 brighten folds.
     bounces: int = 0
     #: Background of the PNG: black, transparent, or the environment. The EXR has coverage and no
@@ -109,7 +110,7 @@ class ViewOptions:
             ),
             "bounces": (self.bounces >= 0, "be 0 or more"),
             "diffusion": (
-                self.diffusion == "clusters"
+                self.diffusion != "shape"
                 or (self.scattering and sj.load_material(self.material).medium is not None),
                 f"be clusters without scattering, or if {self.material} has no [medium]",
             ),
@@ -158,11 +159,7 @@ class ViewOptions:
 
     @property
     def settings(self) -> sj.RenderSettings:
-        diffusers = {
-            "clusters": sj.diffusion.ClusterDiffuser(),
-            "shape": sj.diffusion.ShapeDiffuser(),
-        }
-        return sj.RenderSettings(bounces=self.bounces, diffuser=diffusers[self.diffusion])
+        return sj.RenderSettings(bounces=self.bounces, diffuser=sj.io.DIFFUSERS[self.diffusion])
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
@@ -250,9 +247,9 @@ class ViewOptions:
     ) -> tuple[Path, Path]:
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
         picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
-        solved = self.diffusion == "shape"  # whose one layer is of no Gaussian
+        summed = self.diffusion != "clusters"  # then the one layer is of no Gaussian
         record: dict[str, Any] = {"manifest": self.record(path.parent, material, lights, camera)}
-        record["variances"] = None if solved else material.gaussians.variances.tolist()
+        record["variances"] = None if summed else material.gaussians.variances.tolist()
         sj.write_exr(path, frame, **record, camera=camera, half=self.half)
         if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
             shown = np.asarray(lights[0].behind(frame, camera))
@@ -290,7 +287,7 @@ class ViewOptions:
 
     def note_unresolved_layers(self, frame: sj.Frame, material: sj.Material) -> None:
         """Print the layers that are narrower than the splats."""
-        if self.diffusion == "shape":
+        if self.diffusion != "clusters":
             return
         unresolved = np.asarray(frame.unresolved_fraction) > 0.5
         widths = np.sqrt(np.asarray(material.gaussians.variances))[unresolved]

@@ -23,6 +23,7 @@ from ._diffuser import (
     LayerValues as LayerValues,
     Sources as Sources,
 )
+from ._exitance import ExitanceDiffuser as ExitanceDiffuser
 from ._kernel import (
     AbstractDiffusionKernel as AbstractDiffusionKernel,
     EscapeNormalization as EscapeNormalization,

@@ -11,9 +11,12 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from splatjax._combination import AbstractCombination
 from splatjax._smooth import albedo_root
-from splatjax.scene import Material, Splats
+from splatjax.gaussians import SumOfGaussians
+from splatjax.scene import Material, Scene, Splats
 
 from ._kernel import AbstractDiffusionKernel
+
+_WIDE = 1e12  # mm^2: resolved everywhere
 
 
 class Sources(eqx.Module):
@@ -67,7 +70,7 @@ class LayerValues(eqx.Module):
 
     - `values`: for each channel the weighted mean of the irradiance nearby, which keeps constants,
       is between the least and the greatest irradiance, and is linear in it; last the mass of the
-      kernel on the surface, 1 on a flat sheet.
+      kernel on the surface, 1 on a flat sheet. Or the radiant exitance of each channel alone.
     - `slopes`: of the values in space, 1/mm.
     """
 
@@ -113,6 +116,12 @@ class AbstractDiffusionPlan(eqx.Module):
         if material.medium is None:
             return material
         return dataclasses.replace(material, medium=None)
+
+    def shown(self, scene: Scene) -> Scene:
+        """Return the scene whose weights apply to the layers that passes 2 and 3 blend: those of
+        the scene, or none where `light` has applied them.
+        """
+        return scene
 
     @abc.abstractmethod
     def diffuse(
@@ -221,6 +230,12 @@ class AbstractDiffuser(eqx.Module):
           where several devices hold them.
         - `interval`: from `AbstractDiffusionKernel.interval`.
         """
+
+
+def one_layer(gaussians: SumOfGaussians) -> SumOfGaussians:
+    """Return one Gaussian of weight 1 in place of others, which all splats resolve."""
+    variances = jnp.full_like(gaussians.variances[:1], _WIDE)
+    return SumOfGaussians(variances, jnp.ones_like(gaussians.weights[:1]))
 
 
 def divide_by_mass(

@@ -140,8 +140,8 @@ class LayersAtPoints(eqx.Module):
         **Arguments:**
 
         - `gaussians`: of the layers, as in a plan.
-        - `layers`: means of the channels first, the mass last; those beyond the channels of
-          `irradiance` are omitted.
+        - `layers`: means of the channels first, the mass last, 1 if there is none; those beyond the
+          channels of `irradiance` are omitted.
         """
         count, channels = len(variances), len(irradiance)
         layer = jnp.full(count, len(gaussians), jnp.int32)
@@ -149,7 +149,8 @@ class LayersAtPoints(eqx.Module):
 
         def by_gaussian(rows):
             rows = rows.at[layer].get(mode="fill", fill_value=0)
-            return rows[:, :channels], rows[:, -1]
+            mass = rows[:, -1] if rows.shape[1] > channels else jnp.ones_like(rows[:, 0])
+            return rows[:, :channels], mass
 
         means, mass = by_gaussian(layers)
         return cls(
@@ -186,7 +187,23 @@ class LayersAtPoints(eqx.Module):
         layers, resolved = self._weigh(*given)
         return layers, resolved[:, 0]
 
-    def _weigh(self, weights, variances, single_scattering_albedo, means, mass):
+    def linear_in_means(
+        self, gaussians: SumOfGaussians, single_scattering_albedo: Float[Array, " channels"]
+    ) -> tuple[Float[Array, "channels points"], Float[Array, "gaussians channels points"]]:
+        """Write the radiant exitance as `offset + sum_k factors_k means_k`.
+
+        **Arguments:** as for `weigh`.
+        """
+        weights, variances = gaussians.weights[:, :, None], self.variances[:, None, None]
+        given = weights, variances, single_scattering_albedo, self.mass[:, None]
+        gain, resolved, own = self._gain(*given)
+        gain = weights * gain
+        return jnp.sum(gain * (1 - resolved) * own, axis=0), gain * resolved
+
+    def _gain(self, weights, variances, single_scattering_albedo, mass):
+        """Compute the factor of each layer, the fraction that is the diffusion integral, and the
+        light of the rest.
+        """
         resolved = resolved_fraction(variances, self.area[None, None], self.interval)
         resolved = jnp.where(mass > 0, resolved, 0.0)
         own, root = self.irradiance[None], 1.0
@@ -200,7 +217,11 @@ class LayersAtPoints(eqx.Module):
             weights * self.albedo[None],
             single_scattering_albedo[:, None] * self.albedo,
         )
-        return root * gain * (own + resolved * (means - own)), resolved
+        return root * gain, resolved, own
+
+    def _weigh(self, weights, variances, single_scattering_albedo, means, mass):
+        gain, resolved, own = self._gain(weights, variances, single_scattering_albedo, mass)
+        return gain * (own + resolved * (means - own)), resolved
 
     def exitance(self, gaussians: SumOfGaussians) -> Float[Array, "channels points"]:
         """Compute the radiant exitance `sum_k w_k L_k` of a material without single scattering.

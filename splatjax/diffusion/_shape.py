@@ -9,12 +9,18 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
 from splatjax._records import check_values
-from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
 
 from ._beams import DiffusionCoefficients, scattered_once
-from ._diffuser import AbstractDiffuser, AbstractDiffusionPlan, Beams, Diffused, LayerValues
+from ._diffuser import (
+    AbstractDiffuser,
+    AbstractDiffusionPlan,
+    Beams,
+    Diffused,
+    LayerValues,
+    one_layer,
+)
 from ._emission import SolvedLight, radiance_towards
 from ._hierarchy import Hierarchy, padded_count
 from ._krylov import solve
@@ -25,7 +31,6 @@ _SOFTENING = 2**-0.25  # length over the spacing
 _FINER = 2**-0.5  # softening of the sources, over that on the surface
 _LEAST_KAPPA = 1e-3  # over the root of the area
 _OPEN = 0.05  # sum of the normals, by area, over the area: an open neck leaves 0.08
-_WIDE = 1e12  # mm^2: resolved everywhere
 
 
 class ShapeDiffuser(AbstractDiffuser):
@@ -196,9 +201,7 @@ class ShapePlan(AbstractDiffusionPlan):
                 f"Material.medium is {material.medium}, and ShapeDiffuser needs a Medium of "
                 f"{material.channels} channels; give one, or render with ClusterDiffuser"
             )
-        weights = jnp.ones_like(material.gaussians.weights[:1])
-        variances = jnp.full_like(material.gaussians.variances[:1], _WIDE)
-        shown = material.surface_of(SumOfGaussians(variances, weights))
+        shown = material.surface_of(one_layer(material.gaussians))
         return dataclasses.replace(shown, medium=material.medium)
 
     def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
@@ -207,10 +210,8 @@ class ShapePlan(AbstractDiffusionPlan):
         surface = SurfaceSums.of(splats, self.hierarchy)
         exitance = self.diffuser._solve(surface, medium, entering, bounced)
         solved = SolvedLight.of(surface, material, exitance, entering, bounced)
-        values = jnp.concatenate([exitance, jnp.ones_like(exitance[:1])])
-        rows = values[None], jnp.pad(solved.slopes, ((0, 1), (0, 0), (0, 0)))[None]
         at = jnp.arange(splats.count) if at is None else at
-        layers = LayerValues(*(take_points(row, at) for row in rows))
+        layers = LayerValues(*(take_points(row[None], at) for row in (exitance, solved.slopes)))
         return Diffused(layers, jnp.zeros_like(exitance[0, 0])), solved
 
     def towards(self, eye, splats, material, layers, solved, at):
@@ -219,8 +220,7 @@ class ShapePlan(AbstractDiffusionPlan):
         """
         surface = SurfaceSums.of(splats, self.hierarchy)
         seen = take_points(radiance_towards(eye, surface, material, solved), at)
-        values = jnp.concatenate([seen, layers.values[0, -1:]])
-        return LayerValues(values[None], layers.slopes)
+        return LayerValues(seen[None], layers.slopes)
 
     def diffuse(self, sources, variances, kernel, combination, at=None):
         raise ValueError(

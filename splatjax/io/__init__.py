@@ -52,6 +52,7 @@ from ._lights import (
     read_observations as read_observations,
 )
 from ._scenes import (
+    DIFFUSERS as DIFFUSERS,
     load_scene as load_scene,
     plain_scene as plain_scene,
     scene_table as scene_table,

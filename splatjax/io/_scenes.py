@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from splatjax.diffusion import ClusterDiffuser, ShapeDiffuser
+from splatjax.diffusion import ClusterDiffuser, ExitanceDiffuser, ShapeDiffuser
 from splatjax.exports import plain_numbers
 from splatjax.geometry import bust
 from splatjax.render import RenderSettings
@@ -25,7 +25,11 @@ from ._meshes import sample_mesh
 from ._ply import read_splats, write_splats
 from ._tables import Table, read_toml, write_toml
 
-DIFFUSERS = {"clusters": ClusterDiffuser(), "shape": ShapeDiffuser()}
+DIFFUSERS = {
+    "clusters": ClusterDiffuser(),
+    "exitance": ExitanceDiffuser(),
+    "shape": ShapeDiffuser(),
+}
 _TABLES = ("material", "splats", "camera", "lights", "settings")
 _BODY = ("file", "mesh", "bust", "count", "mm_per_unit", "up", "scale", "albedo")
 _SIZE, _POSE = ("width", "height"), ("position", "rotation", "focal_length")
@@ -50,7 +54,7 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
         image = "studio"             # overcast, sun, or a file; rotation, strength, up
         [settings]                   # optional
         bounces = 1
-        diffusion = "clusters"       # or shape
+        diffusion = "clusters"       # exitance or shape
 
     A camera is instead given by `position`, `rotation`, `focal_length` and `principal_point`, or by
     `file`, `name` and `mm_per_unit` (`load_cameras`). The weights of a material that is named are
@@ -107,8 +111,8 @@ def save_scene(
     plain = RenderSettings(bounces=settings.bounces, diffuser=settings.diffuser)
     if not eqx.tree_equal(settings, plain) or settings.diffuser not in DIFFUSERS.values():
         raise ValueError(
-            f"{path}: stores only bounces and the default ClusterDiffuser or ShapeDiffuser; keep "
-            f"other settings in the program: {settings}"
+            f"{path}: stores only bounces and a default ClusterDiffuser, ExitanceDiffuser or "
+            f"ShapeDiffuser; keep other settings in the program: {settings}"
         )
     for number, light in enumerate(scene.lights, 1):
         image = path.with_name(f"{path.stem}_{number}.exr")
@@ -131,7 +135,7 @@ def plain_scene(
     """Return the contents of a scene's file; [splats] and [[lights]] are given."""
     pose = {name: getattr(camera, name) for name in (*_POSE, "principal_point")}
     pose = {name: plain_numbers(value) for name, value in pose.items() if value is not None}
-    diffusion = "shape" if isinstance(settings.diffuser, ShapeDiffuser) else "clusters"
+    diffusion = next(n for n, kind in DIFFUSERS.items() if kind == settings.diffuser)
     return {
         "material": plain_material(material),
         "splats": dict(splats),

@@ -23,7 +23,7 @@ from ._lighting import Transfer
 from ._passes import SplatLight
 from ._plan import Plan, plan_unless_traced
 from ._render import render, transfer
-from ._settings import RenderSettings, check_no_bounces
+from ._settings import RenderSettings, check_linear_in_weights
 from ._surface import ShadedSurface, in_a_row
 
 
@@ -99,7 +99,7 @@ def diffusion_basis(
             "on the weights; render each material separately, or give single_scattering=None"
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
-    check_no_bounces(settings)
+    check_linear_in_weights(settings)
     scene, plan, light, own = pad_scene(scene, plan, light, camera)
     basis = _diffusion_basis(scene, camera, settings, plan, derivative, light)
     layers = own.of(basis.light, "variances", "means", "mass", "derivative", "factors")

@@ -71,7 +71,8 @@ def pad_scene(
         _check_kept(light, scene, plan)
     material = plan.diffusion.material(scene.material)
     scene = Scene(scene.splats, scene.lights, material)
-    shown = np.arange(min(plan.gaussians, len(material.gaussians.variances)))
+    layers = len(plan.diffusion.shown(scene).material.gaussians.variances)
+    shown = np.arange(min(plan.gaussians, layers))
     own = OwnRows(np.arange(len(scene.lights)), shown)
     leaves = jax.tree.leaves((scene, light, given))
     if plan.mesh is not None or any(isinstance(leaf, Tracer) for leaf in leaves):

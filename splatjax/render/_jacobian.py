@@ -17,7 +17,7 @@ from splatjax.scene import Camera, Frame, Scene
 
 from ._devices import on_devices, pad_scene
 from ._plan import Plan, plan_unless_traced
-from ._settings import LightAtSplats, RenderSettings, check_no_bounces
+from ._settings import LightAtSplats, RenderSettings, check_linear_in_weights
 from ._surface import ShadedSurface, SurfaceSamples, compose, layers_at_points
 
 Parameters = TypeVar("Parameters", bound=PyTree)
@@ -110,7 +110,7 @@ def picture_jacobian(
             "single scattering, which is differentiated only at the splats; give "
             "lighting=LightAtSplats(), or a material without it"
         )
-    check_no_bounces(settings)
+    check_linear_in_weights(settings)
     plan = plan_unless_traced(scene, camera, settings, plan)
     scene, plan, _, own = pad_scene(scene, plan, None, camera)
     jacobian = own.of(_picture_jacobian(scene, camera, settings, plan), "weights", "variances")

@@ -165,11 +165,12 @@ class Passes(eqx.Module):
                 "make it with the same settings"
             )
         at = sightlines.first_splats()
+        shown = self.plan.diffusion.shown(self.scene)
         splats, gaussians = self.scene.splats, material.gaussians
         area, albedo = splats.areas[at], splats.albedo
         root = jnp.ones_like(direct.source) if albedo is None else _shading.albedo_root(albedo.T)
         _, roughness = surface_parameters(self.scene)
-        weights = _diffusion.Sources.of(splats, direct.source).weights
+        weights = _diffusion.Sources.of(shown.splats, direct.source).weights
         f0 = _shading.fresnel_f0(material.eta)
         enters = _shading.average_transmission(f0, roughness, material.angular_law())
         enters = enters.reshape(material.channels, -1)
@@ -183,8 +184,8 @@ class Passes(eqx.Module):
             source = (added * direct.entering + bounced) * root
             given = splats, material, source, beams, self.settings.kernel, self.combination, at
             diffused, _ = self.plan.diffusion.light(*given, bounced * root)
-            weighed, _ = _diffusion.LayersAtPoints.of(
-                gaussians.variances,
+            layers = _diffusion.LayersAtPoints.of(
+                shown.material.gaussians.variances,
                 self.plan.diffusion.gaussians,
                 diffused.layers.values,
                 None,
@@ -194,8 +195,10 @@ class Passes(eqx.Module):
                 self.plan.interval,
                 self.settings.kernel,
                 None if weights is None else weights[..., at],
-            ).weigh(gaussians, material.single_scattering_albedo())
-            exitance = root[:, at] * jnp.sum(gaussians.weights[:, :, None] * weighed, axis=0)
+            )
+            given = shown.material.gaussians, material.single_scattering_albedo()
+            offset, factors = layers.linear_in_means(*given)
+            exitance = root[:, at] * (offset + jnp.sum(factors * layers.means, axis=0))
             received = sightlines.irradiance(exitance, splats.normals, self.combination)
             return (added * enters * received, jnp.maximum(needed, diffused.needed)), None
 
@@ -230,19 +233,21 @@ class Passes(eqx.Module):
 
         # Passes 2 and 3: blend the attributes and layers of the splats that may be visible.
         splats = scene.splats.take(chosen)
-        shown = Scene(splats, scene.lights, scene.material)
+        visible_scene = Scene(splats, scene.lights, scene.material)
+        shown = plan.diffusion.shown(visible_scene)
         layers = plan.diffusion.towards(
             camera.position, scene.splats, scene.material, light.layers, light.solved, chosen
         )
         visibility = LightVisibility(groups, light.visibility, light.needed)
         attributes = settings.lighting.attributes(
-            shown, visibility, light.irradiance, view.position
+            visible_scene, visibility, light.irradiance, view.position
         )
         origin = _splatting.Bounds.of(scene.splats, self.combination).center[:, None]
         origin = jax.lax.stop_gradient(origin)
         centers = splats.centers.T - origin
         attributes = dataclasses.replace(
             attributes,
+            weights=_diffusion.Sources.of(shown.splats, light.irradiance.source).weights,
             centers=centers,
             layers=_diffusion.continue_from_splats(layers, centers),
             derivative=light.derivative
@@ -261,7 +266,7 @@ class Passes(eqx.Module):
             samples = jax.tree.map(in_a_row, samples)
             attributes = settings.lighting.at_pixels(scene, groups, samples)
             planned = plan.diffusion.gaussians, plan.interval, settings.kernel
-            shaded, layers = shade(scene, view.position, groups, samples, attributes, *planned)
+            shaded, layers = shade(shown, view.position, groups, samples, attributes, *planned)
             return read(shaded, layers, samples)
 
         sample = partial(sample_surfaces, visible, attributes, origin)

@@ -71,7 +71,7 @@ def _render(
     def picture(passes, camera, light=None):
         light_at = partial(passes.light, kept=light)
         shaded, visible = passes.picture(camera, light_at, lambda shaded, *_: shaded)
-        return compose(passes.scene, shaded, visible)
+        return compose(plan.diffusion.shown(passes.scene), shaded, visible)
 
     return on_devices(picture, scene, settings, plan, camera, placed=light)
 

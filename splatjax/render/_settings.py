@@ -51,7 +51,6 @@ class AbstractLighting(eqx.Module):
             roughness=None if splats.roughness is None else roughness[None],
             visibility=light.per_light(splats.centers, splats.normals),
             single_scattering=single_scattering_at_splats(scene, light, eye),
-            weights=_diffusion.Sources.of(splats, irradiance.source).weights,
         )
 
     @abc.abstractmethod
@@ -82,8 +81,9 @@ class RenderSettings(eqx.Module):
     - `kernel`: pass 4: source depth, normalization, and resolution of a layer:
       `EscapeNormalization()`, or `PlainMean()`, the paper's.
     - `rasterizer`: `TileRasterizer()`, or `DenseRasterizer()`, the plain reference.
-    - `diffuser`: `ClusterDiffuser()`; `DenseDiffuser()`, the plain reference; or `ShapeDiffuser()`,
-      which solves the diffusion equation in the body.
+    - `diffuser`: `ClusterDiffuser()`; `ExitanceDiffuser()`, the same in less time, without separate
+      layers; `DenseDiffuser()`, the plain reference; or `ShapeDiffuser()`, which solves the
+      diffusion equation in the body.
     - `lighting`: `LightAtSplats()` blends the irradiance of the splats; `splatjax.baselines` has
       others.
     """
@@ -115,8 +115,15 @@ class RenderSettings(eqx.Module):
         return self.sample_shadows if is_sample else self.shadows
 
 
-def check_no_bounces(settings: RenderSettings) -> None:
-    """Raise `ValueError` for bounces, with which a picture is not linear in the weights."""
+def check_linear_in_weights(settings: RenderSettings) -> None:
+    """Raise `ValueError` for bounces, with which a picture is not linear in the weights, and for a
+    diffuser that applies them at the splats.
+    """
+    if isinstance(settings.diffuser, _diffusion.ExitanceDiffuser):
+        raise ValueError(
+            "settings.diffuser is an ExitanceDiffuser, which sums the layers at the splats; give "
+            f"diffuser={settings.diffuser.layers}"
+        )
     if settings.bounces:
         raise ValueError(
             f"settings.bounces is {settings.bounces}, and each bounce depends on the material's "
