@@ -77,23 +77,31 @@ class Materials:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a material's Gaussians as JSON for other renderers.
+    """Write a material for other renderers: its Gaussians as JSON, or its coefficients as an
+    OpenPBR surface in MaterialX.
 
-    Each entry has its formula, unit and source: GPU Gems weights, a kernel for separable subsurface
-    scattering, Burley's d, the shape parameter of Unity's HDRP, Blender's radius.
+    Each entry of the JSON has its formula, unit and source: GPU Gems weights, a kernel for
+    separable subsurface scattering, Burley's d, the shape parameter of Unity's HDRP, Blender's
+    radius.
 
-    Example: splatjax export skin --output skin.json
+    Example: splatjax export marble --output marble.mtlx --mm-per-unit 10
     """
 
     #: Name of a material (`splatjax materials`), or path of a TOML file with a [fit].
     material: tyro.conf.Positional[str]
-    #: JSON file to write.
+    #: JSON or MTLX file to write.
     output: Path
+    #: Length of the unit of the other renderer's scene, mm; for MaterialX.
+    mm_per_unit: float = 1.0
 
     def run(self) -> None:
-        check_output(self.output, (".json",))
+        check_output(self.output, (".json", ".mtlx"))
         with jax.enable_x64(True):
-            sj.io.save_exports(sj.load_material(self.material), self.output)
+            material = sj.load_material(self.material)
+            if self.output.suffix.lower() == ".mtlx":
+                sj.io.save_materialx(self.output, material, mm_per_unit=self.mm_per_unit)
+            else:
+                sj.io.save_exports(material, self.output)
         print(self.output)
 
 

@@ -42,6 +42,7 @@ from ._cameras import (
     load_cameras as load_cameras,
     resized as resized,
 )
+from ._materialx import save_materialx as save_materialx
 from ._meshes import read_textured_mesh as read_textured_mesh, sample_mesh as sample_mesh
 from ._lights import (
     ENVIRONMENTS as ENVIRONMENTS,

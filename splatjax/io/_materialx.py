@@ -1,0 +1,63 @@
+"""Materials as MaterialX documents, in the terms of OpenPBR."""
+
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import jax.numpy as jnp
+import numpy as np
+
+from splatjax.exports import openpbr_subsurface, plain_numbers
+from splatjax.scene import Material
+
+from ._files import StrPath, atomic_path, check_units
+
+_SURFACE, _MATERIAL = "openpbr", "material"
+
+
+def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.0) -> None:
+    r"""Write a material as a MaterialX document with an OpenPBR surface, completely or not at all.
+
+    The color and the mean free path of the subsurface are those of the material's coefficients
+    (`splatjax.exports.openpbr_subsurface`). `specular_roughness` is the root of the
+    material's. The Gaussians are not stored.
+
+    **Arguments:**
+
+    - `material`: of one or three channels, with a `Medium`.
+    - `mm_per_unit`: length of the unit of the other renderer's scene, mm.
+
+    **Raises:** `ValueError` for a material without coefficients, or of another number of channels;
+    `OSError` if the file cannot be written.
+    """
+    check_units(path, mm_per_unit)
+    medium = material.medium
+    if medium is None or medium.channels not in (1, 3):
+        raise ValueError(
+            f"{path}: OpenPBR needs a medium of 1 or 3 channels, and Material.medium is {medium}; "
+            "give coefficients, or export the Gaussians as JSON"
+        )
+    inputs = openpbr_subsurface(medium)
+    inputs["subsurface_radius"] /= mm_per_unit
+    inputs |= {"subsurface_weight": jnp.ones(()), "specular_weight": material.specular}
+    inputs |= {
+        "specular_ior": jnp.mean(medium.eta),
+        "specular_roughness": jnp.sqrt(material.roughness),
+    }
+    root = ElementTree.Element("materialx", version="1.39", colorspace="lin_rec709")
+    surface = ElementTree.SubElement(root, "open_pbr_surface", name=_SURFACE, type="surfaceshader")
+    for name, value in inputs.items():
+        _add_input(surface, name, np.asarray(value))
+    shown = ElementTree.SubElement(root, "surfacematerial", name=_MATERIAL, type="material")
+    given = {"name": "surfaceshader", "type": "surfaceshader", "nodename": _SURFACE}
+    ElementTree.SubElement(shown, "input", given)
+    ElementTree.indent(root)
+    with atomic_path(Path(path)) as temporary:
+        ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
+
+
+def _add_input(node: ElementTree.Element, name: str, value: np.ndarray) -> None:
+    numbers: Any = plain_numbers(np.broadcast_to(value, 3) if value.ndim else value)
+    kind = "color3" if value.ndim else "float"
+    text = ", ".join(map(str, numbers)) if value.ndim else str(numbers)
+    ElementTree.SubElement(node, "input", name=name, type=kind, value=text)
