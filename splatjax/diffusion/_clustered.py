@@ -74,8 +74,7 @@ class ClusterDiffuser(AbstractDiffuser):
         # Sources of a wider layer lie deeper than those of the boxes.
         sinking = math.sqrt(3) * np.asarray(sinking, np.float64)
         reaches = np.where(edges < np.inf, supports * np.sqrt(sizes * self.margin) + sinking, 0)
-        layers = np.asarray(clusters.layers)
-        lists = find_neighbors(points, boxes, layers, reaches.tolist(), parts=len(parts))
+        lists = find_neighbors(points, boxes, clusters.layers, reaches.tolist(), len(parts))
         endless = jnp.asarray(np.where(reaches > 0, reaches, np.inf), variances.dtype)
         return ClusterPlan(
             gaussians=jnp.asarray(gaussians, jnp.int32),

@@ -67,17 +67,17 @@ class LayerSources(eqx.Module):
         nested = dict(zip(cells, nested_cells(centers, normals, exists, cells), strict=True))
         nested[0.0] = np.arange(len(exists), dtype=np.int32), len(exists)
         nested[np.inf] = np.full(len(exists), np.iinfo(np.int32).max // 2, np.int32), 0
-        parents, layers, count = [], [], 0
-        for layer, (own, members) in enumerate(nested[edge] for edge in edges):
-            parents.append(count + own)
-            blocks = -(-members // SOURCES_PER_BLOCK)
-            layers.append(np.full(blocks, layer, np.int32))
-            count += blocks * SOURCES_PER_BLOCK
+        own, members = zip(*(nested[edge] for edge in edges), strict=True)
+        blocks = -(-np.asarray(members) // SOURCES_PER_BLOCK)
+        layers, ends = np.repeat(np.arange(len(edges)), blocks), np.cumsum(blocks)
+        parents = np.stack(own) + SOURCES_PER_BLOCK * (ends - blocks)[:, None]
         half = -(-len(exists) // (2 * SOURCES_PER_BLOCK)) * SOURCES_PER_BLOCK
+        count = SOURCES_PER_BLOCK * len(layers)
         capacity = max(-(-count // half), -(-3 * len(edges) // 2)) * half
-        capacity = reuse_capacity(("sources", parents[0].shape, len(edges)), count, capacity)
-        layers.append(np.zeros((max(capacity, least) - count) // SOURCES_PER_BLOCK, np.int32))
-        return cls(jnp.asarray(np.stack(parents)), jnp.asarray(np.concatenate(layers)))
+        capacity = reuse_capacity(("sources", len(exists), len(edges)), count, capacity)
+        lacking = max(capacity, least) // SOURCES_PER_BLOCK - len(layers)
+        layers = np.pad(layers, (0, lacking))
+        return cls(jnp.asarray(parents, jnp.int32), jnp.asarray(layers, jnp.int32))
 
     @property
     def count(self) -> int:
@@ -141,10 +141,8 @@ def nested_cells(
             _sums(parent, members[:, None] * rows) / inside[:, None] for rows in (positions, facing)
         )
         order = compact_order(positions)
-        rank = np.empty(len(order), np.int32)
-        rank[order] = np.arange(len(order), dtype=np.int32)
         positions, facing, members = positions[order], facing[order], inside[order]
-        of_splats = rank[parent][of_splats]
+        of_splats = np.argsort(order)[parent][of_splats]
         own = np.zeros(len(exists), np.int32)
         own[exists] = of_splats
         levels.append((own, len(order)))
@@ -165,12 +163,8 @@ def _split_by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
     is_split[groups[backs]] = True
     chosen = np.flatnonzero(is_split[groups])
     own, ways = (np.cumsum(is_split) - 1)[groups[chosen]], facing[chosen]
-    rows, columns = np.triu_indices(3)
-    products = np.empty((np.sum(is_split), 3, 3))
-    products[:, rows, columns] = products[:, columns, rows] = _sums(
-        own, ways[:, rows] * ways[:, columns]
-    )
-    axes = np.linalg.eigh(products)[1][:, :, -1]
+    products = _sums(own, (ways[:, :, None] * ways[:, None]).reshape(-1, 9))
+    axes = np.linalg.eigh(products.reshape(-1, 3, 3))[1][:, :, -1]
     sides = 2 * groups
     sides[chosen] += np.sum(ways * axes[own], axis=1) < 0
     return (np.cumsum(np.bincount(sides) > 0) - 1)[sides]

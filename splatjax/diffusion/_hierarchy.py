@@ -11,12 +11,15 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from splatjax._chunking import map_chunks, with_spare
 
 from ._clusters import POINTS_PER_BLOCK, SOURCES_PER_BLOCK
+from ._neighbors import in_rows
 
 # Number of splats in the clusters of each level: runs of the compact order, which is halved down to
 # the first level.
 SIZES = 1, *(SOURCES_PER_BLOCK << level for level in range(9))
+_AXES = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # of second moments
 _WIDTH = 128  # sources in a row
 _ROWS = 16  # at once
+_NONE = np.iinfo(np.int32).max // 2  # beyond all blocks
 
 Planes = tuple[Float[Array, "_"], Float[Array, "_"], Float[Array, "_"]]
 
@@ -44,17 +47,11 @@ class Interactions(eqx.Module):
         block: int,
     ) -> "Interactions":
         """Sort pairs of blocks into rows; `blocks` is the number of blocks of points."""
-        order, width = np.argsort(points, kind="stable"), _WIDTH // block
-        points, sources = points[order], sources[order]
-        lengths = np.bincount(points, minlength=blocks)
-        counts = -(-lengths // width)
-        first, begins = (np.cumsum(each) - each for each in (counts, lengths))
-        rows = with_spare(("interactions", block), int(counts.sum()), _ROWS)
-        ids = np.full((rows, width), np.iinfo(np.int32).max // 2, np.int32)
-        ids.reshape(-1)[(first * width - begins)[points] + np.arange(len(points))] = sources
-        own = np.full(rows, blocks, np.int32)
-        own[: counts.sum()] = np.repeat(np.arange(blocks), counts)
-        return cls(jnp.asarray(own), jnp.asarray(ids), block)
+        rows, counts = in_rows(points, sources, blocks, _WIDTH // block, _NONE)
+        lacking = with_spare(("interactions", block), len(rows), _ROWS) - len(rows)
+        own = np.pad(np.repeat(np.arange(blocks), counts), (0, lacking), constant_values=blocks)
+        rows = np.pad(rows, ((0, lacking), (0, 0)), constant_values=_NONE)
+        return cls(jnp.asarray(own, jnp.int32), jnp.asarray(rows), block)
 
     def reduce(
         self,
@@ -93,6 +90,18 @@ class Hierarchy(eqx.Module):
     near: Interactions
     far: Interactions
 
+    def sum(
+        self,
+        near: Callable,
+        far: Callable,
+        points: PyTree[Array],
+        splats: PyTree[Array],
+        clusters: PyTree[Array],
+    ) -> PyTree[Array]:
+        """Sum `near` over near splats and `far` over clusters, as `Interactions.reduce`."""
+        sums = self.near.reduce(near, points, splats), self.far.reduce(far, points, clusters)
+        return jax.tree.map(jnp.add, *sums)
+
     @classmethod
     def build(
         cls,
@@ -111,29 +120,27 @@ class Hierarchy(eqx.Module):
         - `opening`: radius of a cluster over its distance, at most; with 0 all splats are near.
         - `least`: least distance of a cluster, mm: nearer ones are within reach of the softening.
         """
-        levels, first = [], 0
-        for size in SIZES[1:]:
-            low, high = _boxes(centers, exists, size)
-            radii = 0.5 * np.linalg.norm(np.maximum(high - low, 0), axis=1)
-            levels.append((low, high, radii, first))
-            first += len(low)
+        boxes = [_boxes(centers, exists, size) for size in SIZES[1:]]
+        radii = [0.5 * np.linalg.norm(np.maximum(high - low, 0), axis=1) for low, high in boxes]
+        begins = np.cumsum([0, *map(len, radii[:-1])])
         low_x, high_x = _boxes(centers, exists, POINTS_PER_BLOCK)
-        some, blocks = np.flatnonzero(low_x[:, 0] <= high_x[:, 0]), len(low_x)
-        own, other = np.repeat(some, len(low)), np.tile(np.arange(len(low)), len(some))
+        some, coarsest = np.flatnonzero(low_x[:, 0] <= high_x[:, 0]), len(radii[-1])
+        own, other = np.repeat(some, coarsest), np.tile(np.arange(coarsest), len(some))
         far = []
-        for level, (low, high, radii, begin) in reversed(list(enumerate(levels))):
+        for level in reversed(range(len(boxes))):
+            low, high = boxes[level]
             keep = low[other, 0] <= high[other, 0]
             own, other = own[keep], other[keep]
             gap = np.maximum(low[other] - high_x[own], low_x[own] - high[other])
             squared = np.sum(np.square(np.maximum(gap, 0)), axis=1)
-            is_far = (radii[other] ** 2 < opening**2 * squared) & (squared > least**2)
-            far.append((own[is_far], begin + other[is_far]))
+            is_far = (radii[level][other] ** 2 < opening**2 * squared) & (squared > least**2)
+            far.append((own[is_far], begins[level] + other[is_far]))
             own, other = own[~is_far], other[~is_far]
             if level:
                 own, other = np.repeat(own, 2), (2 * other[:, None] + np.arange(2)).reshape(-1)
-        near = Interactions.of(own, other, blocks, SOURCES_PER_BLOCK)
+        near = Interactions.of(own, other, len(low_x), SOURCES_PER_BLOCK)
         pairs = (np.concatenate(each) for each in zip(*far, strict=True))
-        return cls(near, Interactions.of(*pairs, blocks, 1))
+        return cls(near, Interactions.of(*pairs, len(low_x), 1))
 
 
 def padded_count(count: int) -> int:
@@ -144,6 +151,26 @@ def padded_count(count: int) -> int:
 def cluster_totals(plane: Float[Array, " splats"]) -> Float[Array, " clusters"]:
     """Sum over the clusters of every level except the first."""
     return jnp.concatenate([jnp.sum(plane.reshape(-1, size), axis=1) for size in SIZES[1:]])
+
+
+def clusters(
+    centers: Planes, weights: Float[Array, " splats"]
+) -> tuple[Planes, list[Float[Array, " clusters"]]]:
+    """Compute weighted centers of the clusters of all levels, and half their second moments."""
+
+    def of_level(size):
+        mass = weights.reshape(-1, size)
+        total = jnp.sum(mass, axis=1, keepdims=True)
+        mass = mass / jnp.where(total > 0, total, 1.0)
+        members = [axis.reshape(-1, size) for axis in centers]
+        means = [jnp.sum(mass * axis, axis=1) for axis in members]
+        offsets = [axis - mean[:, None] for axis, mean in zip(members, means, strict=True)]
+        return means, [0.5 * jnp.sum(mass * offsets[i] * offsets[j], axis=1) for i, j in _AXES]
+
+    means, moments = jax.tree.map(
+        lambda *levels: jnp.concatenate(levels), *map(of_level, SIZES[1:])
+    )
+    return tuple(means), moments
 
 
 def _boxes(centers, exists, size):

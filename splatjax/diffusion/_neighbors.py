@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -17,6 +18,9 @@ LANES = 256  # blocks of points that are swept together
 _ROWS = 7  # for every block of points: more than most bodies need, so that they share a program
 _AT_ONCE = 1 << 13  # pairs of boxes whose parts are tested together: they stay in cache
 _FAN = 4  # parts of a box of a coarser level
+
+Corners = tuple[Float[np.ndarray, "_boxes 3"], Float[np.ndarray, "_boxes 3"]]
+Pairs = tuple[Int[np.ndarray, " _pairs"], Int[np.ndarray, " _pairs"]]
 
 
 class Lists(eqx.Module):
@@ -101,6 +105,11 @@ class Boxes(eqx.Module):
         )
         return cls(jnp.min(low, axis=2).T, jnp.max(high, axis=2).T)
 
+    @property
+    def corners(self) -> Corners:
+        """The low and the high corners, for NumPy."""
+        return np.asarray(self.low), np.asarray(self.high)
+
     def beyond(self, planned: "Boxes") -> Float[Array, " blocks"]:
         """Measure the distance (mm, along an axis) by which each box exceeds the planned one."""
         out = jnp.maximum(planned.low - self.low, self.high - planned.high)
@@ -135,7 +144,7 @@ class Neighbors(eqx.Module):
 def find_neighbors(
     points: Boxes,
     sources: Boxes,
-    layers: Int[np.ndarray, " blocks"],
+    layers: Int[Array, " blocks"] | Int[np.ndarray, " blocks"],
     reaches: Sequence[float],
     parts: int = 1,
     least: int = 0,
@@ -152,74 +161,74 @@ def find_neighbors(
     - `parts`: equal parts of the points, each with separate lists, one after the other.
     - `least`: rows of each part.
     """
-    low, high = (np.asarray(each) for each in (sources.low, sources.high))
-    corners = (np.split(np.asarray(corner), parts) for corner in (points.low, points.high))
-    own = [np.flatnonzero(layers == layer) for layer in range(len(reaches))]
+    low, high = sources.corners
+    corners = (np.split(corner, parts) for corner in points.corners)
+    own = [np.flatnonzero(np.asarray(layers) == layer) for layer in range(len(reaches))]
+    blocks = len(points.low) // parts
+    lists = blocks * len(reaches)  # of a part
 
-    def search(part: tuple, layer: int):
-        """Find the pairs of a block of a part and a block of sources."""
+    def search(part: Corners, layer: int) -> Pairs:
+        """Find the pairs of a list of a part and a block of sources."""
         of, near = pairs_in_reach(part, (low[own[layer]], high[own[layer]]), reaches[layer])
-        return of, own[layer][near]
+        return layer * blocks + of, own[layer][near]
 
+    found = []
     # Only NumPy computes in the threads, since JAX's precision may be set for one thread.
-    of_parts = list(zip(*corners, strict=True))
     with ThreadPoolExecutor() as pool:
-        pairs = [
-            [pool.submit(search, part, layer) for layer in range(len(reaches))] for part in of_parts
-        ]
-    blocks = len(of_parts[0][0])
-    found = [_lists([each.result() for each in part], blocks, len(low)) for part in pairs]
+        for part in zip(*corners, strict=True):
+            pairs = pool.map(partial(search, part), range(len(reaches)))
+            of, near = (np.concatenate(each) for each in zip(*pairs, strict=True))
+            rows, counts = in_rows(of, near, lists, BLOCKS_PER_ROW, len(low))
+            order = np.argsort(-counts, kind="stable")
+            found.append((rows, np.cumsum(counts) - counts, counts, order))
     # At least one row, the last, stays empty: lanes whose list has ended read it.
-    lists = len(found[0][1])
-    rows = max(len(ids) for ids, *_ in found)
-    count = max(least, _ROWS * lists, with_spare(("rows", lists), rows, 1, per_octave=2))
+    most = max(len(rows) for rows, *_ in found)
+    count = max(least, _ROWS * lists, with_spare(("rows", lists), most, 1, per_octave=2))
     padded = [
-        (np.pad(ids, ((0, count - len(ids)), (0, 0)), constant_values=len(low)), *each)
-        for ids, *each in found
+        (np.pad(rows, ((0, count - len(rows)), (0, 0)), constant_values=len(low)), *each)
+        for rows, *each in found
     ]
     whole = (np.concatenate(each) for each in zip(*padded, strict=True))
     return Lists(*(jnp.asarray(each, jnp.int32) for each in whole))
 
 
-def _lists(pairs: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, empty: int):
-    """Return the rows of blocks of sources; for every list its first row and their number; and the
-    order of the lists.
-
-    **Arguments:**
-
-    - `pairs`: of each layer, the blocks of points and of sources that are in reach.
-    - `blocks`: of points.
-    - `empty`: the index for no block of sources.
+def in_rows(
+    targets: Int[np.ndarray, " pairs"],
+    sources: Int[np.ndarray, " pairs"],
+    count: int,
+    width: int,
+    empty: int,
+) -> tuple[Int[np.ndarray, "rows width"], Int[np.ndarray, " targets"]]:
+    """Sort the sources of pairs into rows of one target each, targets in ascending order; `empty`
+    fills rows up. Also return the number of rows of each of `count` targets.
     """
-    of = np.concatenate([layer * blocks + each for layer, (each, _) in enumerate(pairs)])
-    near = np.concatenate([each for _, each in pairs])
-    by_list = np.argsort(of, kind="stable")
-    of, near = of[by_list], near[by_list]
-    lengths = np.bincount(of, minlength=blocks * len(pairs))
-    counts = -(-lengths // BLOCKS_PER_ROW)
+    order = np.argsort(targets, kind="stable")
+    targets, sources = targets[order], sources[order]
+    lengths = np.bincount(targets, minlength=count)
+    counts = -(-lengths // width)
     first, begins = (np.cumsum(each) - each for each in (counts, lengths))
-    ids = np.full((counts.sum(), BLOCKS_PER_ROW), empty, np.int32)
-    ids.reshape(-1)[(first * BLOCKS_PER_ROW - begins)[of] + np.arange(len(of))] = near
-    return ids, first, counts, np.argsort(-counts, kind="stable")
+    rows = np.full((counts.sum(), width), empty, np.int32)
+    rows.reshape(-1)[(first * width - begins)[targets] + np.arange(len(targets))] = sources
+    return rows, counts
 
 
-def _levels(corners: tuple, depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def _levels(corners: Corners, depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the corners `[3, parents, parts]` of boxes, `_FAN` of them to a parent, and of ever
     coarser boxes around these; empty boxes fill each level.
     """
-    levels, corners = [], tuple(np.asarray(corner).T for corner in corners)
+    levels, (low, high) = [], (corner.T for corner in corners)
     for _ in range(depth):
-        lacking = ((0, 0), (0, -corners[0].shape[1] % _FAN))
+        lacking = ((0, 0), (0, -low.shape[1] % _FAN))
         low, high = (
-            np.pad(each, lacking, constant_values=empty).reshape(3, -1, _FAN)
-            for each, empty in zip(corners, (np.inf, -np.inf), strict=True)
+            np.pad(corner, lacking, constant_values=empty).reshape(3, -1, _FAN)
+            for corner, empty in ((low, np.inf), (high, -np.inf))
         )
         levels.append((low, high))
-        corners = low.min(axis=2), high.max(axis=2)
+        low, high = low.min(axis=2), high.max(axis=2)
     return levels
 
 
-def pairs_in_reach(points: tuple, sources: tuple, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def pairs_in_reach(points: Corners, sources: Corners, reach: float) -> Pairs:
     """Find the pairs of boxes, given by their corners, that are in reach of each other, from coarse
     to fine.
     """

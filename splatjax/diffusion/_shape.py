@@ -1,8 +1,10 @@
 """The diffusion equation in a body, as an integral equation over its splats."""
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,7 +14,6 @@ from splatjax._records import check_values
 from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
 
-from ._beams import DiffusionCoefficients, scattered_once
 from ._diffuser import (
     AbstractDiffuser,
     AbstractDiffusionPlan,
@@ -21,16 +22,15 @@ from ._diffuser import (
     LayerValues,
     one_layer,
 )
-from ._emission import SolvedLight, radiance_towards
 from ._hierarchy import Hierarchy, padded_count
-from ._krylov import solve
-from ._screened import SOFTENED, ScreenedKernel
-from ._surface_sums import SurfaceSums
+from ._rays import DiffusionCoefficients, SolvedLight, radiance_towards, scattered_once
+from ._surface_sums import SOFTENED, ScreenedKernel, SurfaceSums
 
 _SOFTENING = 2**-0.25  # length over the spacing
 _FINER = 2**-0.5  # softening of the sources, over that on the surface
 _LEAST_KAPPA = 1e-3  # over the root of the area
 _OPEN = 0.05  # sum of the normals, by area, over the area: an open neck leaves 0.08
+_MOST = 24  # products of the solver
 
 
 class ShapeDiffuser(AbstractDiffuser):
@@ -77,9 +77,9 @@ class ShapeDiffuser(AbstractDiffuser):
     def radiant_exitance(
         self,
         splats: Splats,
-        medium: Medium,
+        medium: Medium | None,
         beams: Beams,
-        hierarchy: Hierarchy | None = None,
+        hierarchy: Hierarchy,
         bounced: Float[Array, "channels splats"] | None = None,
     ) -> Float[Array, "channels splats"]:
         """Solve for the light that leaves every splat, in the unit of the irradiance; light that
@@ -88,16 +88,11 @@ class ShapeDiffuser(AbstractDiffuser):
 
         **Arguments:**
 
-        - `hierarchy`: from `find_hierarchy`; needed under `jit`.
+        - `hierarchy`: from `find_hierarchy`.
         - `bounced`: irradiance of uniform light that enters beside the beams.
-
-        **Raises:** `ValueError` as `find_hierarchy`, if none is given.
         """
-        hierarchy = self.find_hierarchy(splats) if hierarchy is None else hierarchy
-        exitance = self._solve(SurfaceSums.of(splats, hierarchy), medium, beams, bounced)
-        return exitance[:, : splats.count]
-
-    def _solve(self, surface: SurfaceSums, medium: Medium, beams: Beams, bounced=None):
+        surface = SurfaceSums.of(splats, hierarchy)
+        beams, bounced = surface.padded((beams, bounced))
         coefficients, area = DiffusionCoefficients.of(medium), jnp.sum(surface.areas)
         spread = jnp.sqrt(jnp.sum(surface.areas**2) / area)
         # A medium without absorption is the limit of a small kappa: the square of this fraction is
@@ -105,33 +100,26 @@ class ShapeDiffuser(AbstractDiffuser):
         kappa = jnp.sqrt(coefficients.squared_kappa + _LEAST_KAPPA**2 / area)
         kernel = ScreenedKernel(kappa, _SOFTENING * spread)
         finer = ScreenedKernel(kappa, _FINER * kernel.length)
-        more = ((0, 0), (0, len(surface.areas) - beams.irradiance.shape[1]))
-        entering = jnp.pad(beams.irradiance, more), jnp.pad(beams.directions, ((0, 0), *more))
-        source, leaving = scattered_once(surface, coefficients, finer, *entering)
+        source, leaving = scattered_once(surface, coefficients, finer, beams)
 
         exists = (surface.areas > 0)[None]
         one, z_e = jnp.ones_like(surface.areas)[None], coefficients.z_e
         share = -surface.layers(ScreenedKernel(jnp.zeros(1, z_e.dtype), kernel.length), [0.0], one)
         # The part that softening removes uses phi of its own splat.
-        own = kernel.plane_integral(jnp.zeros_like(z_e)[:, None])
-        diagonal = share + own / z_e[:, None]
-        diagonal = jnp.where(exists, diagonal, 1.0)
+        unseen = kernel.plane_integral(jnp.zeros_like(z_e)[:, None])
+        diagonal = jnp.where(exists, share + unseen / z_e[:, None], 1.0)
 
         def product(phi):
             return phi + surface.layers(kernel, list(1 / z_e), phi) / diagonal
 
+        flux = (coefficients.diffusion_coefficient / z_e)[:, None]
         if bounced is not None:
-            inward = jnp.pad((coefficients.inward / z_e)[:, None] * bounced, more)
-            unseen = kernel.plane_integral(jnp.zeros_like(inward))
+            leaving = leaving + (1 - flux * coefficients.inward[:, None]) * bounced
+            inward = (coefficients.inward / z_e)[:, None] * bounced
             single_layer = surface.layers(kernel, [1.0] * len(z_e), inward, dipole=0.0)
             source = source + single_layer + unseen * inward
         right = jnp.where(exists, source / diagonal, 0.0)
-        phi = solve(product, right, self.error)
-        flux = (coefficients.diffusion_coefficient / z_e)[:, None]
-        exitance = flux * phi + leaving
-        if bounced is not None:
-            exitance = exitance + jnp.pad((1 - flux * coefficients.inward[:, None]) * bounced, more)
-        return exitance
+        return (flux * solve(product, right, self.error) + leaving)[:, : splats.count]
 
     def find_hierarchy(self, splats: Splats) -> Hierarchy:
         """Check that the splats bound a body, and choose near splats and clusters. Not for traced
@@ -205,11 +193,11 @@ class ShapePlan(AbstractDiffusionPlan):
         return dataclasses.replace(shown, medium=material.medium)
 
     def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
-        medium, entering = material.medium, beams()
-        assert medium is not None
-        surface = SurfaceSums.of(splats, self.hierarchy)
-        exitance = self.diffuser._solve(surface, medium, entering, bounced)
-        solved = SolvedLight.of(surface, material, exitance, entering, bounced)
+        surface, entering = SurfaceSums.of(splats, self.hierarchy), beams()
+        given = splats, material.medium, entering, self.hierarchy, bounced
+        exitance = self.diffuser.radiant_exitance(*given)
+        padded = surface.padded((exitance, entering, bounced))
+        solved = SolvedLight.of(surface, material, *padded)
         at = jnp.arange(splats.count) if at is None else at
         layers = LayerValues(*(take_points(row[None], at) for row in (exitance, solved.slopes)))
         return Diffused(layers, jnp.zeros_like(exitance[0, 0])), solved
@@ -227,3 +215,51 @@ class ShapePlan(AbstractDiffusionPlan):
             "ShapeDiffuser solves for the lights of a scene, not for a given irradiance, nor for "
             "derivatives by Gaussians; render with ClusterDiffuser"
         )
+
+
+def solve(
+    product: Callable, right: Float[Array, "systems unknowns"], error: float
+) -> Float[Array, "systems unknowns"]:
+    """Solve independent systems of linear equations, by generalized conjugate residuals, until
+    every residual is at most `error` times the right side, root mean squares compared.
+    Differentiable by the implicit function theorem.
+
+    **Returns:** the unknowns; NaN in a system that 24 products do not solve.
+
+    **Source:** Eisenstat, Elman and Schultz 1983, "Variational Iterative Methods for Nonsymmetric
+    Systems of Linear Equations"; the iterates are those of GMRES.
+    """
+
+    def iterate(product, right):
+        length = _lengths(right)
+        length = jnp.where(length > 0, length, 1.0)
+        none = jnp.zeros((_MOST, *right.shape), right.dtype)
+
+        def step(state):
+            count, solution, residual, directions, images = state
+            direction, image = residual, product(residual)
+            # Make the image orthogonal to all before; again, for what rounding left.
+            for _ in range(2):
+                along = jnp.einsum("msu,su->ms", images, image)
+                image = image - jnp.einsum("ms,msu->su", along, images)
+                direction = direction - jnp.einsum("ms,msu->su", along, directions)
+            size = _lengths(image)
+            inverse = 1 / jnp.where(size > 0, size, 1.0)
+            direction, image = inverse * direction, inverse * image
+            share = jnp.sum(residual * image, axis=1, keepdims=True)
+            solution, residual = solution + share * direction, residual - share * image
+            directions, images = directions.at[count].set(direction), images.at[count].set(image)
+            return count + 1, solution, residual, directions, images
+
+        def is_unsolved(state):
+            return (state[0] < _MOST) & (jnp.max(_lengths(state[2])) > error)
+
+        start = jnp.int32(0), none[0], right / length, none, none
+        _, solution, residual, *_ = jax.lax.while_loop(is_unsolved, step, start)
+        return length * jnp.where(_lengths(residual) <= error, solution, jnp.nan)
+
+    return jax.lax.custom_linear_solve(product, right, iterate, iterate)
+
+
+def _lengths(rows: Float[Array, "systems unknowns"]) -> Float[Array, "systems 1"]:
+    return jnp.sqrt(jnp.sum(rows * rows, axis=1, keepdims=True))

@@ -87,10 +87,7 @@ class StreamedDiffusion:
         around = Boxes.around(sources.centers, sources.areas > 0, len(sources.areas))
         # Sources are below their splats.
         reach = np.max(self.reaches + np.asarray(self.depths, np.float64))
-        corners = (
-            (np.asarray(boxes.low), np.asarray(boxes.high)) for boxes in (self.boxes, around)
-        )
-        return len(pairs_in_reach(*corners, reach)[0]) > 0
+        return len(pairs_in_reach(self.boxes.corners, around.corners, reach)[0]) > 0
 
     def _sum_part(self, sources: Sources) -> Float[Array, "layers values points"]:
         order = compact_order(np.asarray(sources.centers.T))
@@ -100,8 +97,9 @@ class StreamedDiffusion:
         clusters = LayerSources.build(*arrays, exists, self.edges, self.source_capacity)
         self.source_capacity = max(self.source_capacity, clusters.count)
         below = clusters.merged(sources, self.depths)
-        around, layers = source_boxes(below), np.asarray(clusters.layers)
-        lists = find_neighbors(self.boxes, around, layers, self.reaches, least=self.list_capacity)
+        lists = find_neighbors(
+            self.boxes, source_boxes(below), clusters.layers, self.reaches, least=self.list_capacity
+        )
         self.list_capacity = len(lists.rows)
         return _sum(self.points, below, clusters, self.variances, self.kernels, lists)
 

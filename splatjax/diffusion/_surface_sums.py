@@ -1,20 +1,109 @@
-"""Layer potentials on the surface of a body, and paths through it: sums over all its splats."""
+"""Layer potentials on the surface of a body, and paths through it: sums over all its splats, with
+the Green's function of the diffusion equation, softened within their spacing.
+"""
 
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
 
 from splatjax.scene import Splats
 
-from ._hierarchy import SIZES, Hierarchy, Planes, cluster_totals, padded_count
-from ._screened import ScreenedKernel
+from ._hierarchy import Hierarchy, Planes, cluster_totals, clusters, padded_count
 
 GRAZING = 1e-3  # cosine
 _OVERLAP = 1.5  # radius of a splat over the root of its area
-_AXES = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # of second moments
+_TERMS, _SMALL = 8, 0.1  # of the series of the softening near 0
+_NODES, _REACH = 12, 4.0  # of the integral of what is left out, and its end in softening lengths
+_SCALE = 2 / math.sqrt(math.pi)
+SOFTENED = 3.0  # softening lengths, beyond which the kernel is as without
+
+
+class ScreenedKernel(eqx.Module):
+    r"""`G = exp(-kappa r) / (4 pi r)`, with the distance softened:
+
+        r_s = r / erf(r / length)
+
+    It is smooth, points of a surface at most `length` apart resolve it, and it is `G` beyond three
+    lengths. The part that softening removes is integrated over a plane through each point.
+
+    **Attributes:** (differentiable)
+
+    - `kappa`: 1/mm.
+    - `length`: mm.
+    """
+
+    kappa: Float[Array, "channels"]
+    length: Float[Array, ""]
+
+    def near(self, squared_distances: Float[Array, "*pairs"]) -> list[tuple]:
+        """Compute the softened kernel of every channel, 1/mm, and `-1/r` times its derivative in
+        `r`, 1/mm^3.
+        """
+        inverse, fall = self._softening(squared_distances)
+        distance, inverse, fall = 1 / inverse, inverse / (4 * math.pi), fall / (4 * math.pi)
+
+        def of_channel(kappa):
+            exponent = kappa * distance
+            screened = jnp.exp(-exponent)
+            return inverse * screened, fall * (1 + exponent) * screened
+
+        return [of_channel(kappa) for kappa in self.kappa]
+
+    def far(self, squared_distances: Float[Array, "*pairs"]) -> list[tuple]:
+        """Compute the kernel beyond three lengths, 1/mm, and apply `-1/r d/dr` once, 1/mm^3, and
+        twice, 1/mm^5. All are finite at distance 0.
+        """
+        inverse = jax.lax.rsqrt(jnp.where(squared_distances > 0, squared_distances, 1.0))
+        distance, squared = squared_distances * inverse, inverse * inverse
+
+        def of_channel(kappa):
+            exponent = kappa * distance
+            value = jnp.exp(-exponent) * inverse / (4 * math.pi)
+            once, twice = 1 + exponent, 3 + exponent * (3 + exponent)
+            return value, value * squared * once, value * squared * squared * twice
+
+        return [of_channel(kappa) for kappa in self.kappa]
+
+    def _softening(self, squared_distances):
+        """Compute `1 / r_s`, and `-1/r` times its derivative in `r`."""
+        q = squared_distances / (self.length * self.length)
+        near = q < _SMALL
+        away = jnp.where(near, 1.0, q)
+        root, small = jnp.sqrt(away), jnp.where(near, q, 0.0)
+        ratio = jax.scipy.special.erf(root) / root
+        fall = (ratio - _SCALE * jnp.exp(-away)) / away
+        by_series, fall_by_series = jnp.zeros_like(q), jnp.zeros_like(q)
+        for n in range(_TERMS, -1, -1):
+            term = _SCALE * (-1) ** n / (math.factorial(n) * (2 * n + 1))
+            by_series = by_series * small + term
+            if n:
+                fall_by_series = fall_by_series * small - 2 * n * term
+        ratio = jnp.where(near, by_series, ratio)
+        fall = jnp.where(near, fall_by_series, fall)
+        return ratio / self.length, fall / self.length**3
+
+    def plane_integral(self, height: Float[Array, "channels *points"]) -> Float[Array, "..."]:
+        """Integrate the part that softening removes over a plane, mm.
+
+        **Arguments:**
+
+        - `height`: of the point over the plane, mm.
+        """
+        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+        kappa = self.kappa.reshape(-1, *[1] * (height.ndim - 1))
+        end, total = _REACH * self.length, jnp.zeros_like(height)
+        span = jnp.maximum(end - jnp.abs(height), 0)
+        for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
+            r = end - span * (1 - node) / 2
+            inverse, _ = self._softening(r * r)
+            left_out = jnp.exp(-kappa * r) - r * inverse * jnp.exp(-kappa / inverse)
+            total = total + weight / 4 * span * left_out
+        return total
 
 
 class SurfaceSums(eqx.Module):
@@ -37,6 +126,15 @@ class SurfaceSums(eqx.Module):
             tuple(jnp.pad(rows, ((0, more), (0, 0))).T) for rows in (splats.centers, splats.normals)
         )
         return cls(hierarchy, centers, normals, jnp.pad(splats.areas, (0, more)))
+
+    def padded(self, rows: PyTree[Array]) -> PyTree[Array]:
+        """Append zeros to rows along the splats, for the padding."""
+
+        def pad(row):
+            more = len(self.areas) - row.shape[-1]
+            return jnp.pad(row, [(0, 0)] * (row.ndim - 1) + [(0, more)])
+
+        return jax.tree.map(pad, rows)
 
     def layers(
         self,
@@ -77,20 +175,17 @@ class SurfaceSums(eqx.Module):
             ]
 
         centers, moments = clusters(self.centers, self.areas)
-        totals, dipoles = [], []
-        for charge, strength in zip(charges, powers, strict=True):
-            total = charge * cluster_totals(strength)
-            totals.append(total)
-            dipoles.append(
-                tuple(
-                    cluster_totals(strength * (charge * x + n)) - total * center
-                    for x, n, center in zip(self.centers, facing, centers, strict=True)
-                )
+        channels = list(zip(charges, powers, strict=True))
+        totals = [charge * cluster_totals(power) for charge, power in channels]
+        dipoles = [
+            tuple(
+                cluster_totals(power * (charge * x + n)) - total * center
+                for x, n, center in zip(self.centers, facing, centers, strict=True)
             )
-        given = powers, facing, self.centers
-        nearby = self.hierarchy.near.reduce(near, self.centers, given)
-        beyond = self.hierarchy.far.reduce(far, self.centers, (totals, dipoles, centers, moments))
-        return jnp.stack(nearby) + jnp.stack(beyond)
+            for (charge, power), total in zip(channels, totals, strict=True)
+        ]
+        given = (powers, facing, self.centers), (totals, dipoles, centers, moments)
+        return jnp.stack(self.hierarchy.sum(near, far, self.centers, *given))
 
     def potential(
         self, kernel: ScreenedKernel, charges: Float[Array, " splats"], places: Planes
@@ -118,9 +213,7 @@ class SurfaceSums(eqx.Module):
             return jnp.sum(totals * (value + along * twice), axis=1)
 
         merged = cluster_totals(charges), *clusters(places, charges)
-        return self.hierarchy.near.reduce(
-            near, self.centers, (charges, places)
-        ) + self.hierarchy.far.reduce(far, self.centers, merged)
+        return self.hierarchy.sum(near, far, self.centers, (charges, places), merged)
 
     def first_exits(
         self,
@@ -167,15 +260,14 @@ class SurfaceSums(eqx.Module):
         discs = (self.centers, facing), (centers, tuple(map(cluster_totals, facing)))
         total = cluster_totals(self.areas)
         means = [cluster_totals(self.areas * row) / jnp.where(total > 0, total, 1) for row in rows]
-        rays = self.centers, directions
-
-        def over(function, rays, given, *combine):
-            parts = zip((self.hierarchy.near, self.hierarchy.far), given, strict=True)
-            return [part.reduce(function, rays, sources, *combine) for part, sources in parts]
-
-        start = jax.lax.stop_gradient(jnp.minimum(*over(first, rays, discs, jax.ops.segment_min)))
-        given = tuple(zip(discs, (list(rows), means), strict=True))
-        weight, *sums = jax.tree.map(jnp.add, *over(blend, (*rays, start), given))
+        rays, (near, far) = (self.centers, directions), (self.hierarchy.near, self.hierarchy.far)
+        starting = (
+            each.reduce(first, rays, given, jax.ops.segment_min)
+            for each, given in zip((near, far), discs, strict=True)
+        )
+        start = jax.lax.stop_gradient(jnp.minimum(*starting))
+        given = zip(discs, (list(rows), means), strict=True)
+        weight, *sums = self.hierarchy.sum(blend, blend, (*rays, start), *given)
         is_hit = starts & (weight > 0)
         length, cosine, *read = (row / jnp.where(is_hit, weight, 1.0) for row in sums)
         length = jnp.where(is_hit, length, jnp.where(starts, jnp.inf, 0.0))
@@ -207,12 +299,9 @@ class SurfaceSums(eqx.Module):
         # Twice the variance along the surface.
         variance = squared - dot(center, center) * inverse
         scale = jnp.where(variance > 0, 2 / jnp.where(variance > 0, variance, 1.0), 0.0)
-        slopes = []
-        for mean, product in zip(means, products, strict=True):
-            slope = [scale * (p - c * mean * inverse) for p, c in zip(product, center, strict=True)]
-            across = dot(slope, self.normals)
-            slopes.append([s - across * n for s, n in zip(slope, self.normals, strict=True)])
-        return jnp.asarray(slopes)
+        means, products, center, normals = map(jnp.asarray, (means, products, center, self.normals))
+        slopes = scale * (products - center[None] * (means * inverse)[:, None])
+        return slopes - jnp.sum(slopes * normals[None], axis=1, keepdims=True) * normals[None]
 
 
 def _offset(x, y):
@@ -226,26 +315,6 @@ def _second_moments(moments, offset):
     x, y, z = offset
     along = xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
     return xx + yy + zz, along
-
-
-def clusters(
-    centers: Planes, weights: Float[Array, " splats"]
-) -> tuple[Planes, list[Float[Array, " clusters"]]]:
-    """Compute weighted centers of the clusters of all levels, and half their second moments."""
-
-    def of_level(size):
-        mass = weights.reshape(-1, size)
-        total = jnp.sum(mass, axis=1, keepdims=True)
-        mass = mass / jnp.where(total > 0, total, 1.0)
-        members = [axis.reshape(-1, size) for axis in centers]
-        means = [jnp.sum(mass * axis, axis=1) for axis in members]
-        offsets = [axis - mean[:, None] for axis, mean in zip(members, means, strict=True)]
-        return means, [0.5 * jnp.sum(mass * offsets[i] * offsets[j], axis=1) for i, j in _AXES]
-
-    means, moments = jax.tree.map(
-        lambda *levels: jnp.concatenate(levels), *map(of_level, SIZES[1:])
-    )
-    return tuple(means), moments
 
 
 def dot(one, other):

@@ -247,7 +247,7 @@ class Passes(eqx.Module):
         centers = splats.centers.T - origin
         attributes = dataclasses.replace(
             attributes,
-            weights=_diffusion.Sources.of(shown.splats, light.irradiance.source).weights,
+            weights=attributes.weights if shown.splats.weights is not None else None,
             centers=centers,
             layers=_diffusion.continue_from_splats(layers, centers),
             derivative=light.derivative

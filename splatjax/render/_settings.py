@@ -51,6 +51,7 @@ class AbstractLighting(eqx.Module):
             roughness=None if splats.roughness is None else roughness[None],
             visibility=light.per_light(splats.centers, splats.normals),
             single_scattering=single_scattering_at_splats(scene, light, eye),
+            weights=_diffusion.Sources.of(splats, irradiance.source).weights,
         )
 
     @abc.abstractmethod
