@@ -166,11 +166,12 @@ class Sample:
     albedo: OptionalPath = None
     #: Gray map of factors on the material's specular strength.
     specular: OptionalPath = None
-    #: Gray map: how much of the surface is of --second, from black for none to white for all.
+    #: Gray map: the fraction of the surface that consists of --second, from none (black) to all
+    #: (white).
     share: OptionalPath = None
-    #: With --share, the material that the splats will be rendered with.
+    #: With --share, the material with which the splats will be rendered.
     material: Annotated[str, tyro.conf.arg(metavar="MATERIAL")] = "skin_light"
-    #: With --share, the other material.
+    #: With --share, the second material.
     second: Annotated[str | None, tyro.conf.arg(metavar="MATERIAL", help_behavior_hint="")] = None
     #: Tangent-space normal map; green points up.
     normal: OptionalPath = None

@@ -49,11 +49,12 @@ class Recover:
         direction = [1, -0.3, -0.5]
         irradiance = [3.14, 3.14, 3.14]
 
-    A light is also of kind "point" (position, intensity) or "beam" (origin, direction, power,
-    variance).
+    Other kinds of lights are "point" (position, intensity), "beam" (origin, direction, power,
+    variance), and "rectangle" (center, edges, radiance), "disk" (center, direction, radius,
+    radiance) and "sphere" (center, radius, radiance).
 
-    The albedo of the splats is not used: the coefficients give all color. After an interruption the
-    same command continues from the best medium so far.
+    The albedo of the splats is not used: the coefficients give all color. After an interruption,
+    run the same command again; it continues from the best medium so far.
 
     Example: splatjax recover head.ply pictures.toml --start skin1 marble --output mine.toml
     --report mine.png
@@ -89,7 +90,7 @@ class Recover:
     specular: float = 0.0
     #: Roughness of the specular lobe.
     roughness: float = 0.3
-    #: Report the picture to take next, among some with the camera of the first.
+    #: Report the picture to take next, among candidates with the camera of the first picture.
     suggest: bool = True
 
     def run(self) -> None:

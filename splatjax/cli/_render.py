@@ -165,7 +165,7 @@ class Turntable(ViewOptions):
     program is compiled once for all frames. With --turn camera and no fill, the light below the
     surface is computed once too; for an environment that turns, shadow maps are rendered once.
     Existing frames are kept: after an interruption, run the same command again. A record in the
-    folder, turntable.json, prevents that frames with different options are mixed. If a launcher has
+    folder, turntable.json, prevents a mixture of frames with different options. If a launcher has
     started several processes (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and
     JAX_PROCESS_ID), they share the frames of one folder that all of them can access.
 

@@ -18,26 +18,26 @@ _DIRECTIONS = 64  # of the shadows of an environment
 
 @dataclass(frozen=True, kw_only=True)
 class Studio(ViewOptions):
-    """Show splats, or the built-in bust, in a page of the browser, to turn and to change.
+    """Open a page in the browser on which splats, or the built-in bust, can be turned and changed.
 
-    It needs viser: pip install 'splatjax[studio]'. The address of the page is printed; Ctrl-C ends
-    it. Coefficients can be changed of a material that has a [medium]. The page saves the material,
-    pictures, and the program that makes a picture.
+    It needs viser, the extra `studio` of splatjax. The command prints the address of the page;
+    Ctrl-C ends it. Sliders change the coefficients of a material that has a [medium]. The page
+    saves the material, pictures, and the program that renders a picture.
 
     Example: splatjax studio --material marble --no-albedo --scale 0.2
     """
 
-    #: The folder for what is saved; it is made where its parent exists.
+    #: The folder for saved files. It is created if its parent exists.
     output: Path = Path("studio")
     #: Number of splats of the built-in bust.
     count: int = 100_000
     #: TOML file that lists pictures, as for `splatjax recover`: the page takes the camera and the
     #: lights of the first, and offers to recover the material.
     pictures: OptionalPath = None
-    #: The address to listen at. With another one than 127.0.0.1, whoever reaches it can change the
-    #: scene and save.
+    #: The address to listen at. At any address except 127.0.0.1, other computers that reach it can
+    #: change the scene and save files.
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    #: The port, or the next one that is free.
+    #: The port to listen at; if it is in use, the next free one.
     port: int = 8080
 
     def run(self) -> None:
