@@ -198,12 +198,12 @@ def fit_gaussians(
     - `count`: number of Gaussians, at least 1; or `LeastCount(error)`, the least number that
       reaches the error.
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
-    - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, or `NonNegativeWeights()`
-      among either.
-    - `start`: `GivenVariances(...)` near the best fit, which is fast, only for a given count; by
-      default it is found without.
+    - `weights`: `FreeWeights()` (default); `FixedTotalReflectance()`, which keeps the energy; or
+      `NonNegativeWeights(...)`, either of these without negative weights.
+    - `start`: `GivenVariances(...)` near those of the best fit, from which one fast search starts;
+      it needs a given count. By default fits with fewer Gaussians give the start.
     - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for
-      one with standard errors.
+      a profile with standard errors.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.
 
     **Returns:** a `FitResult`; `error` and `weights` do not depend on the unit of length.

@@ -45,15 +45,15 @@ def bust_mesh() -> Mesh:
 
 @kept
 def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
-    r"""Make the bust as splats, in the colors of skin.
+    r"""Sample splats from the built-in bust, 33 cm tall, in the colors of skin.
 
     **Arguments:**
 
     - `count`: number of splats, at least 1.
     - `seed`: of the random positions; the same seed gives the same splats.
 
-    **Returns:** splats in Morton order with albedo, specular and roughness, in JAX's default
-    precision; their areas add up to that of the mesh. `splatjax.geometry.sample_mesh` describes
+    **Returns:** splats with albedo, specular and roughness, mm, in JAX's default precision and in
+    Morton order. Their areas add up to that of the mesh. `splatjax.geometry.sample_mesh` describes
     their distribution.
 
     **Raises:** `ValueError` when `count` is below 1.

@@ -164,7 +164,7 @@ def load_mean_cosine(name_or_path: StrPath) -> float:
 
 
 def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin:
-    r"""Load the coefficients of a material as the profile that its Gaussians approximate, or its
+    r"""Load the coefficients of a material as a profile to which Gaussians can be fitted, or its
     pigments.
 
     **Arguments:**
@@ -194,8 +194,8 @@ def save_material(
 
     - `material`: one material (no batch); written with enough digits to be restored exactly.
     - `path`: of the file; its folder must exist.
-    - `profile`: the profile of the fit; its coefficients are written instead of the material's
-      `medium`, and its kind in [fit].
+    - `profile`: the profile to which the Gaussians were fitted. Its coefficients are written in
+      place of the material's `medium`, and its kind into [fit].
     - `source`: source of the numbers: `citation`, `provenance`, ...
     - `fit`: further entries of [fit]: `error`, `energy_error`, ...
     - `g`: mean cosine of the phase function, kept in [medium].

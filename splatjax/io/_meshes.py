@@ -76,8 +76,9 @@ def sample_mesh(
       of the file, if any.
     - `specular`: gray picture, not decoded: factor on the material's specular strength.
     - `normal`: tangent-space normal map, not decoded; green points up.
-    - `share`: gray picture, not decoded: how much of the surface is of another material, whose
-      weights are `factors` times those of the material (`splatjax.fitting.weight_factors`).
+    - `share`, `factors`: gray picture, not decoded: the fraction of the surface that consists of a
+      second material, whose weights are `factors` times those of the first
+      (`splatjax.fitting.weight_factors`).
     - `v_up`: whether v = 0 is the *lower* edge of a map. `None` uses the rule of the format: yes
       for all except glTF and GLB. Wrongly converted files need `True`: otherwise the texture is
       upside down.
@@ -87,7 +88,7 @@ def sample_mesh(
       if the file has no normals, or normals that differ by more than this from their triangles.
     - `seed`: of the random positions.
     - `rounded`: place splats on a curved surface that follows the mesh's normals, instead of on its
-      flat triangles, whose edges are visible at the edge of light. Hard edges stay straight.
+      flat triangles, which make the edge between light and shadow ragged. Hard edges stay straight.
 
     **Returns:** splats in mm; `splatjax.geometry.sample_mesh` describes their distribution.
 

@@ -72,7 +72,8 @@ def read_splats(
     | `specular`, `roughness` | factors on the material's |
     | `weight_1_1`, `weight_1_2`, ... | factors on the material's weights: Gaussian, channel |
 
-    Other properties and elements are ignored; faces without radii cause a warning.
+    Other properties and elements are ignored. A file with faces and without radii causes a warning,
+    because a mesh should be sampled (`sample_mesh`).
 
     The ellipsoids of a Gaussian-splatting scene (`f_dc_0`, `scale_0`, `rot_0`, ...) become discs:
     the flattest axis is the normal, and the two others give the radius. A warning reports that
@@ -82,7 +83,7 @@ def read_splats(
 
     - `mm_per_unit`: length of the file's unit, mm.
     - `up`: the file's upward axis, `"y"` or `"z"`; splats have +y up.
-    - `opacity`: ellipsoids below it are left out.
+    - `opacity`: ellipsoids with a lower opacity are omitted.
 
     **Returns:** splats in mm, in JAX's default precision and in Morton order.
 

@@ -87,9 +87,9 @@ def make_plan(
     settings: RenderSettings = RenderSettings(),
     mesh: Mesh | None = None,
 ) -> Plan:
-    r"""Compute the capacities and orders for rendering a scene with these cameras.
+    r"""Compute the array sizes and the order of the splats, which `jit` and `grad` need in advance.
 
-    **Arguments:** concrete, not traced.
+    **Arguments:** concrete arrays, so call it outside of `jit` and `grad`.
 
     - `scenes`: one, or several that differ only in their lights: the same splats and material,
       lights of the same kinds in the same order.

@@ -38,10 +38,10 @@ def render(
 
     - `scene`: splats (mm), lights and material. Differentiable; the choice of visible splats is
       not.
-    - `camera`: Differentiable.
-    - `settings`: of each pass.
-    - `plan`: from `splatjax.make_plan`; required under `jit`, `grad` and `vmap`, otherwise made
-      here.
+    - `camera`: position and size of the picture. Differentiable.
+    - `settings`: of the passes.
+    - `plan`: from `splatjax.make_plan`, for this scene or one near it. Required under `jit`, `grad`
+      and `vmap`; otherwise made for each call.
     - `mesh`: devices over which the splats and their gradients are divided, of any axes
       (docs/devices.md). By default the mesh of the plan.
     - `light`: a precomputed result for the same settings and plan: from `splatjax.illuminate` with

@@ -69,24 +69,25 @@ class LightAtSplats(AbstractLighting):
 
 
 class RenderSettings(eqx.Module):
-    r"""How each pass works.
+    r"""Settings of the passes, and the algorithms that compute them.
 
-    **Attributes:**
+    **Attributes:** (the defaults suit most pictures)
 
-    - `splatting`: passes 2 and 3: epsilon-z, the screen filter.
-    - `shadows`: pass 1: resolution and bias of shadow maps.
-    - `sample_shadows`: the same for the samples of extended lights, which are many, so each map is
-      coarser. `ShadowSettings()` makes them as fine as those of other lights.
+    - `splatting`: of passes 2 and 3: depth of the front surface (epsilon-z), screen filter.
+    - `shadows`: of pass 1: resolution, bias and softness of shadow maps.
+    - `sample_shadows`: the same for the samples of environments and area lights, which are many, so
+      each map is coarser. `ShadowSettings()` makes them as fine as those of other lights.
     - `bounces`: number of times that light may leave the body and enter it again. Static.
-    - `sightlines`: the directions in which each splat sees the body, for bounces.
-    - `kernel`: pass 4: source depth, normalization, and resolution of a layer:
-      `EscapeNormalization()`, or `PlainMean()`, the paper's.
-    - `rasterizer`: `TileRasterizer()`, or `DenseRasterizer()`, the plain reference.
-    - `diffuser`: `ClusterDiffuser()`; `ExitanceDiffuser()`, the same in less time, without separate
-      layers; `DenseDiffuser()`, the plain reference; or `ShapeDiffuser()`, which solves the
-      diffusion equation in the body.
-    - `lighting`: `LightAtSplats()` blends the irradiance of the splats; `splatjax.baselines` has
-      others.
+    - `sightlines`: the directions in which each splat searches the body, for bounces.
+    - `kernel`: of pass 4: source depth, normalization, and resolution of a layer.
+      `EscapeNormalization()`, or `PlainMean()`, that of the paper.
+    - `rasterizer`: algorithm of passes 1 to 3. `TileRasterizer()`, or `DenseRasterizer()`, the
+      plain reference.
+    - `diffuser`: algorithm of pass 4. `ClusterDiffuser()`; `ExitanceDiffuser()`, the same in less
+      time, without separate layers; `DenseDiffuser()`, the plain reference; or `ShapeDiffuser()`,
+      which solves the diffusion equation in the body.
+    - `lighting`: where irradiance is computed. `LightAtSplats()` blends that of the splats;
+      `splatjax.baselines` has others.
     """
 
     splatting: _splatting.SplattingSettings = _splatting.SplattingSettings()

@@ -106,7 +106,7 @@ class AbstractDipole(AbstractHalfSpace):
 
 @record
 class Dipole(AbstractDipole):
-    r"""The dipole of a semi-infinite medium.
+    r"""The classical dipole: the profile of a half space, with which most fits are published.
 
     With `z_r = 1 / sigma_t'`, `z_v = z_r (1 + 4A/3)` and `d^2 = r^2 + z^2`,
 

@@ -18,13 +18,15 @@ from ._quadrature import unit_interval
 
 @record
 class Medium(eqx.Module):
-    r"""A homogeneous medium under the diffusion approximation.
+    r"""The optical coefficients of a homogeneous material.
 
-    **Attributes:** (any number of channels; all differentiable)
+        Medium([0.020, 0.006, 0.015], [1.1, 1.3, 1.5], eta=1.6)
+
+    **Attributes:** (any number of channels; a single number is for all of them; differentiable)
 
     - `sigma_a`: absorption coefficient, 1/mm, at least 0.
-    - `sigma_s_prime`: reduced scattering coefficient, 1/mm, positive.
-    - `eta`: index of refraction relative to air.
+    - `sigma_s_prime`: reduced scattering coefficient `sigma_s (1 - g)`, 1/mm, positive.
+    - `eta`: index of refraction relative to air, positive.
 
     **Raises:** `ValueError` for a value out of these ranges. Under `jit` values are unknown, and
     not checked.
@@ -64,11 +66,11 @@ class Medium(eqx.Module):
 
 @record
 class Layer(eqx.Module):
-    r"""A slab of a scattering medium.
+    r"""A layer of a scattering medium between two parallel planes.
 
     **Attributes:** (differentiable)
 
-    - `medium`: its coefficients, [channels].
+    - `medium`: coefficients, [channels].
     - `thickness`: mm; infinite for the lowest layer of a half space.
 
     **Raises:** `ValueError` for a negative thickness.

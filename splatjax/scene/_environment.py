@@ -50,7 +50,7 @@ class EnvironmentLight(AbstractExtendedLight):
       rotation (`splatjax.transfer`). The light of every pixel is distributed to the directions near
       it.
     - `count`: number of samples that are chosen by the image. Static.
-    - `cast_shadows`: static.
+    - `cast_shadows`: whether it has shadow maps. Static.
 
     **Raises:** `ValueError` for an image that is not twice as wide as high, or has integers, or
     negative or infinite radiance.

@@ -146,14 +146,14 @@ def _per_channel(
 
 @record
 class DirectionalLight(AbstractLightSample):
-    r"""Parallel light of a distant source.
+    r"""Parallel light of a distant source, such as the sun.
 
     **Attributes:**
 
     - `direction`: the way the light travels, any length but zero. Differentiable.
     - `irradiance`: on a surface that faces the light; pi on a white diffuser gives radiance 1.
       Differentiable.
-    - `cast_shadows`: static.
+    - `cast_shadows`: whether it has a shadow map. Static.
     """
 
     direction: Float[Array, "3"] = eqx.field(converter=numbers)
@@ -180,7 +180,7 @@ class PointLight(AbstractLightSample):
     - `position`: mm. Differentiable.
     - `intensity`: power per solid angle; the irradiance is `intensity cos / d^2`, d in mm.
       Differentiable.
-    - `cast_shadows`: static.
+    - `cast_shadows`: whether it has a shadow map. Static.
     """
 
     position: Float[Array, "3"] = eqx.field(converter=numbers)

@@ -19,24 +19,27 @@ _NARROW = 1e-6  # mm^2: far below any splat, so that the layer is unresolved
 class Material(eqx.Module):
     r"""A translucent material: the diffusion below the surface, and the reflection at the surface.
 
+        material = load_material("marble")
+        material = Material(fit_gaussians(Dipole(load_medium("marble"))).gaussians, eta=1.5)
+
     **Attributes:** (all differentiable)
 
-    - `gaussians`: the diffusion profile; the picture's diffuse reflectance is the sum of its
-      weights.
-    - `eta`: index of refraction relative to air, of the specular lobe and of the light that enters
-      and leaves (at any strength of the lobe). With 1 the surface reflects nothing.
-    - `specular`: strength of the specular lobe (rho_s). With 1 it reflects exactly the light that
-      does not enter.
-    - `roughness`: of the specular lobe (m, root mean square slope), at least 0.
+    - `gaussians`: the diffusion profile. The sum of its weights is the diffuse reflectance.
+    - `eta`: index of refraction relative to air, positive. It determines how much light the surface
+      reflects and how much enters, at any strength of the lobe. With 1 the surface reflects
+      nothing.
+    - `specular`: strength of the specular lobe (rho_s), at least 0. With 1 the lobe reflects
+      exactly the light that does not enter.
+    - `roughness`: root mean square slope of the surface (m), at least 0; rendered as 0.05 to 1.
     - `single_scattering`: light that scatters once, as a separate term; the Gaussians then
-      represent the rest. `None`: they represent all light.
+      represent the rest. `None`: the Gaussians represent all light.
     - `angles`: the dependence of the light of the Gaussians on the angles at which it enters and
       leaves. `None`: no dependence.
     - `medium`: coefficients, which `ShapeDiffuser` uses instead of Gaussians, single scattering and
       angles; or `None`.
 
-    **Raises:** `ValueError` for a value out of range, and for single scattering or angles of
-    another number of channels than the Gaussians have.
+    **Raises:** `ValueError` for a value out of range, and for a single scattering or angles whose
+    number of channels differs from that of the Gaussians.
     """
 
     gaussians: SumOfGaussians

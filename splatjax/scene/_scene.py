@@ -24,7 +24,7 @@ _FARTHEST = 1e15  # single precision can square such a number, and multiply the 
 
 @record
 class Camera(eqx.Module):
-    r"""A pinhole camera.
+    r"""A pinhole camera; `Camera.look_at` places one by position and target.
 
     Pixel centers are at half integers; the origin of the picture is its top left corner. In camera
     coordinates x points right, y down, and z into the picture.
@@ -120,10 +120,10 @@ _NOT_NEGATIVE = valid("finite and at least 0", lambda x: x >= 0)
 
 @record
 class Splats(eqx.Module):
-    r"""A surface as a set of discs, one row per splat; mm, right-handed, +y up.
+    r"""The surface of a body as overlapping discs, one row per splat; mm, right-handed, +y up.
 
-    Nearby splats should be near in memory, as `read_splats` and `sample_mesh` sort them. The order
-    changes the time, not the picture.
+    Splats that are near in space should be near in memory, as `read_splats` and `sample_mesh` sort
+    them. The order changes the time, not the picture.
 
     **Attributes:** (all differentiable unless stated otherwise)
 
@@ -133,12 +133,12 @@ class Splats(eqx.Module):
       the area.
     - `areas`: the area of the surface that each splat represents, mm^2. They add up to the area of
       the surface. (The discs overlap, so `pi r^2` is not the area.)
-    - `albedo`: diffuse color, linear, in [0, 1]; `None` if the material's weights alone give the
-      color.
+    - `albedo`: diffuse color, linear, in [0, 1], which multiplies that of the material; `None` if
+      the material alone gives the color.
     - `specular`: factor on the material's specular strength; `None` for 1.
     - `roughness`: factor on the material's roughness; `None` for 1.
-    - `weights`: factor on the material's weights, for each Gaussian and channel: of freckles, lips
-      or veins. `None` for 1.
+    - `weights`: factor on the material's weights, for each Gaussian and channel, by which the
+      material varies over the body: freckles, lips, veins. `None` for 1.
 
     **Raises:** `ValueError` for arrays of different lengths, for entries that are not finite, for
     negative radii, areas and factors, and for an albedo outside [0, 1].
@@ -190,10 +190,16 @@ Parts: TypeAlias = Callable[[], Iterable[Splats]]
 
 @record
 class Scene(eqx.Module):
-    """Splats of one material under some lights. Lights of one kind are computed together.
+    """A body of one material under lights: the differentiable input of `render`.
 
-    `lights` may be given as a list or as a single light. A light of one channel applies to every
-    channel of the material.
+        scene = Scene(bust(100_000), DirectionalLight((0, 0, -1), 3.14), load_material("marble"))
+
+    **Attributes:** (differentiable)
+
+    - `splats`: the surface of the body.
+    - `lights`: any number, as a list, a tuple, or a single light. A light of one channel applies to
+      every channel of the material. Lights of one kind are computed together.
+    - `material`: of all splats. For splats with albedo, usually `material.white()`.
     """
 
     splats: Splats
