@@ -27,7 +27,7 @@ import splatjax as sj
 from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# The bust has a seventh of life size, so that few splats resolve the diffusion of light in skin.
+# The bust is scaled to 0.15 of its size, so that few splats resolve the diffusion of light in skin.
 # One light casts shadows, and a weak one does not.
 
 # %%

@@ -27,8 +27,8 @@ import splatjax as sj
 from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# The bust has a third of life size, so that few splats resolve the diffusion of light in skin. One
-# light casts shadows, and a weak one does not.
+# The bust is scaled to 0.3 of its size, so that few splats resolve the diffusion of light in skin.
+# One light casts shadows, and a weak one does not.
 
 # %%
 body = sj.bust(40_000).scaled(0.3)

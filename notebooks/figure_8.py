@@ -31,8 +31,8 @@ from splatjax.io import srgb_to_linear
 from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# The head of the bust at a third of life size. Its chart is longitude and latitude seen from
-# inside, in which its ears overlap the head.
+# The head of the bust, scaled to 0.3 of its size. Its texture coordinates are longitude and
+# latitude, seen from inside; in them the ears overlap the head.
 
 # %%
 SCALE, SIZE = 0.3, 256

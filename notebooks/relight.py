@@ -11,7 +11,7 @@
 # ---
 
 # %% [markdown]
-# # New light on a kept view
+# # New light on a rendered view
 #
 # A picture is linear in its light. This notebook renders a bust once under each of 25 spherical
 # harmonics. Its picture under any smooth environment is then a sum, which takes milliseconds. The

@@ -89,7 +89,7 @@ def material(wider: float) -> sj.Material:
 # %% [markdown]
 # ## Fit along the gradient
 #
-# Offsets are blurred over 1 mm, about the spacing of the splats, so finer bumps are not searched.
+# Offsets are blurred over 1 mm, about the spacing of the splats, so finer bumps are not recovered.
 # Outlines are not used, since only pixels that the body fills count.
 
 
