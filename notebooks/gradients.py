@@ -101,8 +101,8 @@ with jax.enable_x64(True):
 # ## A derivative picture
 #
 # `sj.picture_jacobian` renders a picture and computes the derivative of every pixel in every weight
-# and variance. It costs about one more frame, for any number of pixels. `through` continues the
-# derivative to the parameters of the Gaussians, here the coefficients of marble.
+# and variance. It takes about twice as long as a frame, for any number of pixels. `through`
+# continues the derivative to the parameters of the Gaussians, here the coefficients of marble.
 
 # %%
 with jax.enable_x64(True):

@@ -1,4 +1,4 @@
-"""The Jacobian of a picture in its material, pixel by pixel, for about one more pass 4."""
+"""The Jacobian of a picture in its material, pixel by pixel, in about the time of two frames."""
 
 import dataclasses
 from collections.abc import Callable
@@ -90,9 +90,9 @@ def picture_jacobian(
     material.
 
     The result is the derivative of the picture that `render` computes, with its approximations, and
-    equals reverse mode for each pixel. It costs about one more pass 4: less than two and a half
-    frames, for any number of pixels or parameters. It is the Jacobian of Gauss and Newton's method
-    for least squares; `through` computes the Jacobian in optical coefficients.
+    equals reverse mode for each pixel. It takes less than two and a half times as long as `render`,
+    for any number of pixels or parameters. It is the Jacobian of Gauss and Newton's method for
+    least squares; `through` computes the Jacobian in optical coefficients.
 
     **Arguments:** as for `render`; under `jit` a plan is needed. With `ClusterDiffuser`, it cannot
     be differentiated again.
