@@ -208,12 +208,12 @@ def write_exr(
 
     Pictures of another number of channels than 3 have `beauty.1`, `beauty.2`, ..., `albedo.1`, ...
     instead of R G B. The header contains the weights of the Gaussians (`splatjax.weights.1`, ...: a
-    value per channel), their variances (mm^2) if given, the color space (linear, Rec. 709
-    primaries, D65), and, if given, the settings of the picture as JSON in `splatjax.manifest`
-    (`read_manifest`).
+    value per channel) and the color space (linear, Rec. 709 primaries, D65).
 
     **Arguments:**
 
+    - `variances`: of the Gaussians, mm^2, written to the header.
+    - `manifest`: settings of the picture, written to the header as JSON (`read_manifest`).
     - `camera`: of the picture, written as `worldToCamera` (right, up and forward, mm) and
       `worldToNDC` (column and row over the size of the picture), which `load_cameras` reads. Both
       are of row vectors: `[x y z 1] M`, divided by the last entry.

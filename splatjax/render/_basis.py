@@ -209,8 +209,8 @@ def relighting_basis(
         basis = relighting_basis(Scene(splats, white, material), camera)
         picture = basis.beauty(HarmonicLight.of(environment))
 
-    It takes about as long as one picture per harmonic with kept shadows; the shadow maps are
-    rendered once. Pictures under other light are then cheap, and linear in it.
+    It takes about as long as one picture per harmonic without shadow maps, which are rendered once.
+    Pictures under other light are then cheap, and linear in the light.
 
     **Arguments:** as for `render`.
 

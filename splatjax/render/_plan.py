@@ -93,7 +93,8 @@ def make_plan(
 
     - `scenes`: one, or several that differ only in their lights: the same splats and material,
       lights of the same kinds in the same order.
-    - `cameras`: all have pictures of one size.
+    - `cameras`: one or several, whose pictures have one size.
+    - `settings`: those of the pictures.
     - `mesh`: devices over which the splats are divided for rendering; planned on one.
 
     **Returns:** a `Plan` for every scene with every camera, and for scenes and materials near

@@ -32,10 +32,10 @@ class EnvironmentLight(AbstractExtendedLight):
     is +y and the lower one -y; the middle is +z, a quarter of the width to the left of it is +x,
     and both side edges are -z. This is the view from inside the sphere.
 
-    It is sampled by `count` directions. The sphere is divided into strata of equal importance,
-    which is nine parts radiance times solid angle and one part solid angle. Each sample has the
-    irradiance of all pixels of its stratum, the mean direction of their radiance, and a shadow map.
-    Highlights are not sampled: glossy surfaces reflect the image, blurred by the lobe.
+    It is sampled by `count` directions. The sphere is divided into strata of equal importance, of
+    which 90% is radiance times solid angle and 10% solid angle. A sample has the irradiance of all
+    pixels of its stratum, the mean direction of their radiance, and a shadow map. Highlights are
+    not sampled: glossy surfaces reflect the image, blurred by the lobe.
 
     **Attributes:**
 
