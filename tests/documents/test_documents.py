@@ -4,6 +4,7 @@ program names what is there; what commands and programs can do on small stand-in
 
 import ast
 import contextlib
+import dataclasses
 import importlib
 import inspect
 import os
@@ -184,6 +185,29 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
         output = given[given.index("--output") + 1] if "--output" in given else None
         assert output is None or output in os.listdir(), command
         assert output is not None or given[0] == "materials" or set(os.listdir()) > before
+
+
+MATERIALS = (ROOT / "docs" / "materials.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.once
+@pytest.mark.parametrize(
+    ("heading", "record"),
+    [("Surface", sj.Material), ("Pigments of skin", sj.scattering.Skin)],
+)
+def test_the_tables_of_parameters_have_the_defaults_and_ranges_of_the_records(heading, record):
+    _, section = MATERIALS.split(f"### {heading}\n")
+    lines = re.findall(r"^\| `(\w+)` \|(.*)\|$", section.split("\n### ")[0], re.MULTILINE)
+    rows = {name: cells.replace("\N{MINUS SIGN}", "-").split(" | ") for name, cells in lines}
+    numbers = [
+        field for field in dataclasses.fields(record) if isinstance(field.default, int | float)
+    ]
+    assert {field.name for field in numbers} == rows.keys() - {"wavelengths"}
+    for field in numbers:
+        *_, limits, default = rows[field.name]
+        assert float(default.split(";")[0]) == field.default
+        between = re.match(r"between (\S+) and (\S+)", field.metadata["valid"][0])
+        assert between is None or limits == f"{between[1]} to {between[2]}"
 
 
 EQUATIONS = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
