@@ -113,15 +113,30 @@ def _left_out(item) -> bool:
 
 
 # Beside tests marked `once`: what JAX has little part in.
-ONCE = ("io/test_corpus", "geometry/test_raw_points", "test_imports")
+ONCE = ("io/test_corpus", "geometry/test_raw_points", "test_imports", "cli/test_faults", "plots/")
+# What is about files, words and searches, and not about sums that an optimizing compiler rounds.
+UNOPTIMIZED = (
+    "tests/io/",
+    "tests/cli/",
+    "tests/exports/",
+    "tests/documents/",
+    "tests/inverse/",
+    "tests/fitting/",
+    "test_cache",
+    "test_chunking",
+    "test_records",
+)
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest chooses by marks
 def pytest_collection_modifyitems(config, items):
     """Leave out, and say so, what cannot run or need not run twice."""
     for item in items:
-        if any(name in item.nodeid for name in ONCE):
+        names = item.fixturenames
+        if "float64" not in names and any(name in item.nodeid for name in ONCE):
             item.add_marker("once")
+        if "float32" not in names and any(name in item.nodeid for name in UNOPTIMIZED):
+            item.add_marker("unoptimized")
     # The longest files first, so that no worker is left alone with one in the end.
     longest = (
         "tests/inverse",

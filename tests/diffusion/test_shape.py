@@ -64,6 +64,7 @@ def exitance(sphere) -> np.ndarray:
     return np.asarray(solved(sphere, medium(), beams(sphere)))
 
 
+@pytest.mark.once
 def test_a_sphere_shines_as_in_light_transport(sphere, exitance):
     band = np.minimum((angles(sphere) / 30).astype(int), 5)
     means = np.stack([np.bincount(band, row) / np.bincount(band) for row in exitance])
