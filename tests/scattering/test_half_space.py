@@ -20,6 +20,7 @@ def half_space(albedo, eta=1.0, g=0.0) -> HalfSpace:
     return HalfSpace(sj.Medium(2 * (1 - albedo), 2 * albedo, eta), g)
 
 
+@pytest.mark.unoptimized
 def test_published_totals():
     """Indices matched: Chandrasekhar, 1 - H(1) sqrt(1 - albedo). Index 1.5: Giovanelli 1955, with
     what the surface itself reflects.
@@ -228,6 +229,7 @@ SKINS = {
 SURFACE = (0.4 / 2.4) ** 2  # what an index of 1.4 reflects along the normal
 
 
+@pytest.mark.unoptimized
 @pytest.mark.parametrize("name", SKINS)
 def test_reflectance_lies_in_the_measured_range(name):
     skin = Skin(**SKINS[name], wavelengths=MEASURED_AT)
@@ -237,6 +239,7 @@ def test_reflectance_lies_in_the_measured_range(name):
     np.testing.assert_array_less(100 * reflected, high)
 
 
+@pytest.mark.unoptimized
 def test_hemoglobin_has_two_bands_with_oxygen_and_one_without():
     at = [530, 545, 560, 575, 590]
     full, empty = (
