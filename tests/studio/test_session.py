@@ -21,7 +21,7 @@ from splatjax.studio import Page, Search, Session, save, turned
 
 pytestmark = pytest.mark.once
 
-SIDE = 32
+SIDE = 48
 # Levels of 255: rounding.
 SAME = 1
 # The mean of a picture of 375 splats and 16 x 16 pixels.
@@ -266,7 +266,7 @@ def test_a_browser_orbits_drags_and_saves(page, tmp_path):
         picture = Image.open(io.BytesIO(window.screenshot())).convert("RGB")
         middle = picture.crop((200, 0, 700, 500)).resize((SIDE, SIDE), Image.Resampling.BOX)
         seen, made = (np.asarray(each, float) for each in (middle, page._image))
-        shown = np.abs(seen - made)[:, 8:22]  # between a note of viser and the panel
+        shown = np.abs(seen - made)[:, 11:34]  # between a note of viser and the panel
         assert shown.mean() < SHOWN
         window.mouse.move(200, 250)
         window.mouse.down()
