@@ -100,9 +100,9 @@ def diffusion_basis(
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
     check_linear_in_weights(settings)
-    scene, plan, light, own = pad_scene(scene, plan, light, camera)
+    scene, plan, light, own_rows = pad_scene(scene, plan, light, camera)
     basis = _diffusion_basis(scene, camera, settings, plan, derivative, light)
-    layers = own.of(basis.light, "variances", "means", "mass", "derivative", "factors")
+    layers = own_rows.of(basis.light, "variances", "means", "mass", "derivative", "factors")
     return dataclasses.replace(basis, light=layers)
 
 
@@ -221,7 +221,7 @@ def relighting_basis(
 
     **Raises:** `ValueError` as `render`, and for other lights.
     """
-    kinds = [type(given).__name__ for given in scene.lights]
+    kinds = [kind.__name__ for kind in map(type, scene.lights)]
     if kinds != ["HarmonicLight"]:
         raise ValueError(
             f"scene.lights are {', '.join(kinds) or 'none'}; give one HarmonicLight, and "
@@ -239,21 +239,21 @@ def _relighting_basis(
     def coefficients(scene):
         return scene.lights[0].coefficients
 
-    given = coefficients(scene)
+    template = coefficients(scene)
     kept = transfer(scene, plan, settings) if light is None else light
 
     def under(harmonics: Float[Array, " harmonics"]):
-        gray = jnp.broadcast_to(harmonics[:, None], given.shape)
+        gray = jnp.broadcast_to(harmonics[:, None], template.shape)
         lit = eqx.tree_at(coefficients, scene, gray)
         frame = render(lit, camera, settings, plan, light=kept)
         return frame.beauty, frame.coverage, frame.overflow
 
     # Add uniform light to each harmonic so that the sum is nowhere negative: layers of pass 4 are
     # limited at zero where they do not reach a pixel.
-    count = len(given)
+    count = len(template)
     even = np.sqrt(2 * np.floor(np.sqrt(np.arange(count))) + 1) * (np.arange(count) > 0)
-    even = jnp.asarray(even, given.dtype)
-    lights = jnp.eye(count, dtype=given.dtype).at[:, 0].add(even)
+    even = jnp.asarray(even, template.dtype)
+    lights = jnp.eye(count, dtype=template.dtype).at[:, 0].add(even)
     pictures, coverage, overflow = jax.lax.map(under, lights)
     pictures = pictures - even[:, None, None, None] * pictures[:1]
     return RelightingBasis(pictures, coverage[0], overflow[0])

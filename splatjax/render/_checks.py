@@ -126,14 +126,14 @@ def _winding_number(centers, normals, areas, camera: Camera) -> float:
     return float(cosines @ angles) / (4 * np.pi)
 
 
-def in_one_dtype(scene: Scene, *rest):
+def in_one_dtype(scene: Scene, *trees):
     """Cast every float to the dtype of the splats' centers, once."""
     dtype = scene.splats.centers.dtype
 
     def cast(leaf):
         return leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf
 
-    return jax.tree.map(cast, (scene, *rest))
+    return jax.tree.map(cast, (scene, *trees))
 
 
 def check_channels(scene: Scene) -> None:

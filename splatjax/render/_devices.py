@@ -48,11 +48,11 @@ class OwnRows(NamedTuple):
 
 
 def pad_scene(
-    scene: Scene, plan: Plan, light: Kept | None = None, *given: PyTree
+    scene: Scene, plan: Plan, light: Kept | None = None, *trees: PyTree
 ) -> tuple[Scene, Plan, Kept | None, OwnRows]:
     """Pad the splats of a scene to the length of its plan, the lights of each kind to four or a
     larger power of two, the Gaussians and the angles. NumPy and `device_put` do this, which compile
-    nothing. If the scene or `given` is traced, or splats are divided over devices, nothing changes.
+    nothing. If the scene or `trees` is traced, or splats are divided over devices, nothing changes.
 
     The plan's order has no entry for a padding splat. A padding light has no strength and no shadow
     map; a padding Gaussian has no weight. If a light of the scene consists of several samples, or
@@ -73,10 +73,10 @@ def pad_scene(
     scene = Scene(scene.splats, scene.lights, material)
     layers = len(plan.diffusion.shown(scene).material.gaussians.variances)
     shown = np.arange(min(plan.gaussians, layers))
-    own = OwnRows(np.arange(len(scene.lights)), shown)
-    leaves = jax.tree.leaves((scene, light, given))
+    own_rows = OwnRows(np.arange(len(scene.lights)), shown)
+    leaves = jax.tree.leaves((scene, light, trees))
     if plan.mesh is not None or any(isinstance(leaf, Tracer) for leaf in leaves):
-        return scene, plan, light and resize_visibility(light, scene), own
+        return scene, plan, light and resize_visibility(light, scene), own_rows
     splats, lights, shadows = scene.splats, scene.lights, plan.shadows
     if 0 < splats.count < len(plan.order):
         splats = jax.tree.map(lambda leaf: take_rows(leaf, np.arange(len(plan.order))), splats)
@@ -84,7 +84,7 @@ def pad_scene(
         groups = lights_by_kind(lights)
         numbered = [light for group in groups for light in group + _pad_lights(group, len(lights))]
         order = np.argsort([number for number, _ in numbered], stable=True)
-        own = own._replace(lights=order[: len(lights)])
+        own_rows = own_rows._replace(lights=order[: len(lights)])
         lights = [light for _, light in numbered]
         shadows = tuple(
             shadow and dataclasses.replace(shadow, lights=jax.device_put(np.int32(len(group))))
@@ -92,8 +92,8 @@ def pad_scene(
         )
     gaussians = pad_gaussians(material.gaussians)
     if splats.weights is not None:
-        known = np.arange(len(gaussians.variances))
-        weights = take_rows(splats.weights.swapaxes(0, 1), known).swapaxes(0, 1)
+        rows = np.arange(len(gaussians.variances))
+        weights = take_rows(splats.weights.swapaxes(0, 1), rows).swapaxes(0, 1)
         splats = dataclasses.replace(splats, weights=weights)
     material = eqx.tree_at(
         lambda material: (material.gaussians, material.angles),
@@ -104,7 +104,7 @@ def pad_scene(
     counts = {"splats": splats.count, "gaussians": len(gaussians.variances)}
     plan = dataclasses.replace(plan, shadows=shadows, **counts)
     scene = Scene(splats, lights, material)
-    return scene, plan, light and resize_visibility(light, scene), own
+    return scene, plan, light and resize_visibility(light, scene), own_rows
 
 
 def _pad_lights(
@@ -157,7 +157,7 @@ def on_devices(
     scene: Scene,
     settings: RenderSettings,
     plan: Plan,
-    *whole: PyTree,
+    *replicated: PyTree,
     rows: tuple[PyTree[Float[Array, "splats ..."]], ...] = (),
     placed: PyTree = None,
     by_splat: bool = False,
@@ -167,54 +167,54 @@ def on_devices(
 
     **Arguments:**
 
-    - `function`: of the passes of a device, then of `whole`, `rows` and, if given, `placed`.
-    - `whole`: replicated on every device.
+    - `function`: of the passes of a device, then of `replicated`, `rows` and, if given, `placed`.
+    - `replicated`: the same on every device.
     - `rows`: one row per splat, in the order of the scene.
     - `placed`: results of an earlier call along the splats, in the order of the plan.
     - `by_splat`: the results are along the splats, in the order of the plan; otherwise they are the
       same on all devices.
     """
-    scene, whole, rows = in_one_dtype(scene, whole, rows)
+    scene, replicated, rows = in_one_dtype(scene, replicated, rows)
     devices, per_device = splats_per_device(scene.splats.count, plan.mesh)
     count = devices * per_device
     scene = Scene(pad_splats(scene.splats, count), scene.lights, scene.material)
     rows = jax.tree.map(lambda row: jnp.pad(row, ((0, count - len(row)), (0, 0))), rows)
     extra = () if placed is None else (placed,)
 
-    def run(combination: AbstractCombination, scene: Scene, plan: Plan, whole, rows, extra):
+    def run(combination: AbstractCombination, scene: Scene, plan: Plan, replicated, rows, extra):
         splats = arrange(scene.splats, plan.order, plan.exists)
         scene = Scene(splats, scene.lights, scene.material)
         rows = jax.tree.map(lambda row: row[plan.order], rows)
         passes = Passes(scene, settings, plan, combination)
-        return function(passes, *whole, *rows, *extra)
+        return function(passes, *replicated, *rows, *extra)
 
-    given = scene, plan, whole, rows, extra
+    arguments = scene, plan, replicated, rows, extra
     if plan.mesh is None:
-        return run(DeviceMesh(), *given)
+        return run(DeviceMesh(), *arguments)
     mesh = DeviceMesh.of(plan.mesh)
-    of_scene, of_whole = jax.tree.map(lambda _: PartitionSpec(), (scene, whole))
+    of_scene, of_replicated = jax.tree.map(lambda _: PartitionSpec(), (scene, replicated))
     of_splats, of_rows = jax.tree.map(lambda _: mesh.shares, (scene.splats, rows))
     specs = (
         eqx.tree_at(lambda scene: scene.splats, of_scene, of_splats),
         plan.specs(mesh),
-        of_whole,
+        of_replicated,
         of_rows,
         along_splats(extra, mesh),
     )
     out_specs = PartitionSpec()
     if by_splat:
-        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), given)
-        results = jax.eval_shape(lambda given: run(DeviceMesh(), *given), shapes)
+        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), arguments)
+        results = jax.eval_shape(lambda arguments: run(DeviceMesh(), *arguments), shapes)
         out_specs = along_splats(results, mesh)
     # The check of varying axes is off: custom derivatives and loops have no rules for it.
     mapped = jax.shard_map(
-        lambda *given: run(mesh, *given),
+        lambda *shares: run(mesh, *shares),
         mesh=plan.mesh,
         in_specs=specs,
         out_specs=out_specs,
         check_vma=False,
     )
-    return mapped(*lay_out(plan.mesh, given, specs))
+    return mapped(*lay_out(plan.mesh, arguments, specs))
 
 
 def along_splats(tree: PyTree, devices: DeviceMesh) -> PyTree:
@@ -277,8 +277,8 @@ def _map_over(mesh: Mesh, function: Callable, shared: PyTree, batch: PyTree, cou
         arrays = arrays[0], jax.tree.map(lambda *leaves: jnp.concatenate(leaves), arrays[1], last)
 
     def share(shared, batch):
-        whole = eqx.combine(shared, static[0])
-        return jax.lax.map(lambda one: function(whole, eqx.combine(one, static[1])), batch)
+        replicated = eqx.combine(shared, static[0])
+        return jax.lax.map(lambda item: function(replicated, eqx.combine(item, static[1])), batch)
 
     specs = (
         jax.tree.map(lambda _: PartitionSpec(), arrays[0]),
@@ -290,5 +290,5 @@ def _map_over(mesh: Mesh, function: Callable, shared: PyTree, batch: PyTree, cou
     results = mapped(*lay_out(mesh, arrays, specs))
     if not lacking:
         return results
-    whole = lay_out(mesh, results, jax.tree.map(lambda _: PartitionSpec(), results))
-    return jax.tree.map(lambda leaf: leaf[:count], whole)
+    replicated = lay_out(mesh, results, jax.tree.map(lambda _: PartitionSpec(), results))
+    return jax.tree.map(lambda leaf: leaf[:count], replicated)

@@ -112,9 +112,9 @@ def picture_jacobian(
         )
     check_linear_in_weights(settings)
     plan = plan_unless_traced(scene, camera, settings, plan)
-    scene, plan, _, own = pad_scene(scene, plan, None, camera)
-    jacobian = own.of(_picture_jacobian(scene, camera, settings, plan), "weights", "variances")
-    return dataclasses.replace(jacobian, frame=own.frame(jacobian.frame))
+    scene, plan, _, own_rows = pad_scene(scene, plan, None, camera)
+    jacobian = own_rows.of(_picture_jacobian(scene, camera, settings, plan), "weights", "variances")
+    return dataclasses.replace(jacobian, frame=own_rows.frame(jacobian.frame))
 
 
 @kept_jit

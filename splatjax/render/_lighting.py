@@ -271,8 +271,8 @@ def surface_parameters(
     """Multiply the material's specular strength and roughness with the splats' own."""
     material, splats = scene.material, scene.splats
     specular = material.specular if splats.specular is None else material.specular * splats.specular
-    own = splats.roughness
-    return specular, material.roughness if own is None else material.roughness * own
+    factor = splats.roughness
+    return specular, material.roughness if factor is None else material.roughness * factor
 
 
 def beams_at_splats(
@@ -295,8 +295,14 @@ def beams_at_splats(
             inside = wi[:, axis] / material.eta + inward * splats.normals[:, axis]
             return -(fraction * inside)[None]
 
-        given = splats.centers, splats.normals, light.groups, light.visibility
-        return _shading.sum_received(*given, enters, material.channels)
+        return _shading.sum_received(
+            splats.centers,
+            splats.normals,
+            light.groups,
+            light.visibility,
+            enters,
+            material.channels,
+        )
 
     directions = jnp.stack([along(axis) for axis in range(3)], axis=1)
     entering = jnp.where(irradiance.entering > 0, irradiance.entering, 1.0)

@@ -112,19 +112,19 @@ class Passes(eqx.Module):
         light = self.visibility(kept)
         irradiance, bounced, beams, bounce_needed = self.irradiance(light)
         source, added, slopes, solved = irradiance.source, None, None, None
-        given = self.settings.kernel, self.combination, at
+        kernel, combination = self.settings.kernel, self.combination
         if derivative:
             if material.single_scattering is not None:
                 added = _source_derivative(self.scene, light)
                 source = jnp.concatenate([source, added])
             sources = _diffusion.Sources.of(splats, source)
             diffused, differentiated = self.plan.diffusion.diffuse_with_derivative(
-                sources, material.gaussians.variances, *given
+                sources, material.gaussians.variances, kernel, combination, at
             )
             slopes = differentiated.layers
         else:
             diffused, solved = self.plan.diffusion.light(
-                splats, material, source, beams, *given, bounced
+                splats, material, source, beams, kernel, combination, at, bounced
             )
         needed = jnp.maximum(light.needed, jnp.maximum(bounce_needed, diffused.needed))
         along_splats = light.visibility, irradiance, added
@@ -166,7 +166,7 @@ class Passes(eqx.Module):
             )
         at = sightlines.first_splats()
         shown = self.plan.diffusion.shown(self.scene)
-        splats, gaussians = self.scene.splats, material.gaussians
+        splats, gaussians, kernel = self.scene.splats, material.gaussians, self.settings.kernel
         area, albedo = splats.areas[at], splats.albedo
         root = jnp.ones_like(direct.source) if albedo is None else _shading.albedo_root(albedo.T)
         _, roughness = surface_parameters(self.scene)
@@ -176,14 +176,15 @@ class Passes(eqx.Module):
         enters = enters.reshape(material.channels, -1)
         # The Gaussians also represent light that scatters once: for direct light where it leaves,
         # for bounced light where it enters.
-        whole, diffused = material.total_reflectance(), gaussians.total_reflectance()
-        added = (whole / jnp.where(diffused > 0, diffused, 1.0))[:, None]
+        total, diffused = material.total_reflectance(), gaussians.total_reflectance()
+        added = (total / jnp.where(diffused > 0, diffused, 1.0))[:, None]
 
         def bounce(so_far, _):
             bounced, needed = so_far
             source = (added * direct.entering + bounced) * root
-            given = splats, material, source, beams, self.settings.kernel, self.combination, at
-            diffused, _ = self.plan.diffusion.light(*given, bounced * root)
+            diffused, _ = self.plan.diffusion.light(
+                splats, material, source, beams, kernel, self.combination, at, bounced * root
+            )
             layers = _diffusion.LayersAtPoints.of(
                 shown.material.gaussians.variances,
                 self.plan.diffusion.gaussians,
@@ -193,11 +194,12 @@ class Passes(eqx.Module):
                 jnp.where(area > 0, area, 1.0),
                 root[:, at] ** 2,
                 self.plan.interval,
-                self.settings.kernel,
+                kernel,
                 None if weights is None else weights[..., at],
             )
-            given = shown.material.gaussians, material.single_scattering_albedo()
-            offset, factors = layers.linear_in_means(*given)
+            offset, factors = layers.linear_in_means(
+                shown.material.gaussians, material.single_scattering_albedo()
+            )
             exitance = root[:, at] * (offset + jnp.sum(factors * layers.means, axis=0))
             received = sightlines.irradiance(exitance, splats.normals, self.combination)
             return (added * enters * received, jnp.maximum(needed, diffused.needed)), None

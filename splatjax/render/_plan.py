@@ -108,8 +108,8 @@ def make_plan(
     cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
     scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
     _check(scenes, cameras)
-    (scene, *others), cameras = _on_one_device((scenes, cameras))
-    scene, others, cameras = in_one_dtype(scene, others, cameras)
+    (scene, *other_scenes), cameras = _on_one_device((scenes, cameras))
+    scene, other_scenes, cameras = in_one_dtype(scene, other_scenes, cameras)
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
     parts, order, exists = _cut_and_order(scene.splats, mesh)
     bounds, interval = _measure(parts, settings.kernel)
@@ -121,7 +121,7 @@ def make_plan(
         exists=exists,
         shadows=tuple(
             _plan_shadows(group, parts, bounds, settings)
-            for group in _groups([scene.lights for scene in (scene, *others)])
+            for group in _groups([scene.lights for scene in (scene, *other_scenes)])
         ),
         diffusion=settings.diffuser.make_plan(parts, variances, settings.kernel, interval),
         interval=interval,
@@ -151,13 +151,13 @@ def check_plan(plan: Plan, scene: Scene, mesh: Mesh | None = None) -> None:
     """Raise `ValueError` for a plan that was made for other splats, another number of Gaussians,
     or another mesh.
     """
-    for what, planned, count in (
+    for name, planned, count in (
         ("splats", plan.splats, scene.splats.count),
         ("Gaussians", plan.gaussians, len(scene.material.gaussians.variances)),
     ):
         if planned != count:
             raise ValueError(
-                f"the plan is for {planned} {what}, and the scene has {count}; make another plan"
+                f"the plan is for {planned} {name}, and the scene has {count}; make another plan"
             )
     if mesh is not None and plan.mesh != mesh:
         made_for = "one device" if plan.mesh is None else f"{plan.mesh}"
@@ -216,8 +216,8 @@ def _on_one_device(tree: Result) -> Result:
     def gathered(leaf):
         if not isinstance(leaf, jax.Array) or isinstance(leaf.sharding, SingleDeviceSharding):
             return leaf
-        whole = leaf if leaf.is_fully_addressable else process_allgather(leaf, tiled=True)
-        return jnp.asarray(np.asarray(whole))
+        array = leaf if leaf.is_fully_addressable else process_allgather(leaf, tiled=True)
+        return jnp.asarray(np.asarray(array))
 
     return jax.tree.map(gathered, tree)
 
@@ -230,10 +230,10 @@ def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Arr
     places = rounded_up(per_device, _diffusion.POINTS_PER_BLOCK, per_octave=16)
     places = reuse_capacity("splats", per_device, places, most=_MOST_SPLATS)
     repeated = (0, places - per_device)
-    whole = jax.tree.map(np.asarray, pad_splats(splats, per_device * devices))
+    padded = jax.tree.map(np.asarray, pad_splats(splats, per_device * devices))
     parts, orders, exist = [], [], []
     for first in range(0, per_device * devices, per_device):
-        part = jax.tree.map(lambda leaf, i=first: leaf[i : i + per_device], whole)
+        part = jax.tree.map(lambda leaf, i=first: leaf[i : i + per_device], padded)
         order = _diffusion.compact_order(part.centers).astype(np.int32)
         exist.append(np.pad(first + order < splats.count, repeated))
         orders.append(np.pad(order, repeated, mode="edge"))

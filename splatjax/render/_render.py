@@ -56,8 +56,8 @@ def render(
     disagree.
     """
     plan = plan_unless_traced(scene, camera, settings, plan, mesh)
-    scene, plan, light, own = pad_scene(scene, plan, light, camera)
-    return own.frame(_render(scene, camera, settings, plan, light))
+    scene, plan, light, own_rows = pad_scene(scene, plan, light, camera)
+    return own_rows.frame(_render(scene, camera, settings, plan, light))
 
 
 @kept_jit
@@ -184,8 +184,8 @@ def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> I
 
     irradiance = on_devices(entering, scene, settings, plan, by_splat=True)
     if plan.mesh is not None:
-        whole = jax.tree.map(lambda _: PartitionSpec(), irradiance)
-        irradiance = lay_out(plan.mesh, irradiance, whole)
+        replicated = jax.tree.map(lambda _: PartitionSpec(), irradiance)
+        irradiance = lay_out(plan.mesh, irradiance, replicated)
     return jax.tree.map(lambda rows: rows[:, : scene.splats.count], irradiance)
 
 
@@ -233,9 +233,10 @@ def _diffuse_irradiance(
         source, gaussians = irradiance.T, material.gaussians
 
         def light_at(chosen):
-            sources, given = Sources.of(splats, source), (settings.kernel, passes.combination)
-            diffusion = passes.plan.diffusion
-            diffused = diffusion.diffuse(sources, gaussians.variances, *given, chosen)
+            sources, diffusion = Sources.of(splats, source), passes.plan.diffusion
+            diffused = diffusion.diffuse(
+                sources, gaussians.variances, settings.kernel, passes.combination, chosen
+            )
             seen = take_points(source, chosen)
             irradiance = Irradiance(entering=seen, source=seen)
             return SplatLight([], irradiance, diffused.layers, None, None, diffused.needed)

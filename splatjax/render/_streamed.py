@@ -108,14 +108,14 @@ def render_streamed(
 
     def scenes(task: str) -> Iterator[Scene]:
         for part in reported(task):
-            whole = Scene(pad_splats(part, part_size), tuple(lights), material)
-            yield in_one_dtype(whole)[0]
+            scene = Scene(pad_splats(part, part_size), tuple(lights), material)
+            yield in_one_dtype(scene)[0]
 
     first = next(iter(scenes("looking")))
     check_channels(first)
     (first, camera), groups = in_one_dtype(first, camera), stack_lights(first.lights)
     dtype, view = first.splats.centers.dtype, _splatting.PerspectiveView.of(camera)
-    middle, reach = (jnp.asarray(of, dtype) for of in (statistics.middle, statistics.reach))
+    middle, reach = (jnp.asarray(bound, dtype) for bound in (statistics.middle, statistics.reach))
     bounds = _splatting.Bounds(middle, reach)
 
     # Pass 1: the shadow maps of each light that casts shadows, in its group.
@@ -237,7 +237,7 @@ def _light(
 
     def of_light(group: StackedLights, maps: Sequence[_splatting.ShadowMap]):
         shadows, cube = settings.shadows_of(group.lights), len(maps) > 1
-        return sum(map_visibility(scene, each, shadows, cube) for each in maps)
+        return sum(map_visibility(scene, shadow_map, shadows, cube) for shadow_map in maps)
 
     visibility = [
         None if of_group is None else jnp.stack([of_light(group, maps) for maps in of_group])

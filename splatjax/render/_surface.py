@@ -259,20 +259,20 @@ def _shadows_in_order(
     return jnp.stack(planes) if planes else jnp.zeros((0, *depth.shape), depth.dtype)
 
 
-def map_places(function: Callable[..., Result], *given: PyTree) -> Result:
+def map_places(function: Callable[..., Result], *arrays: PyTree) -> Result:
     """Apply a pointwise function to chunks of places.
 
     **Arguments:**
 
     - `function`: returns arrays `[*rows, points]`, the pixels of its places in a row.
-    - `given`: arrays along the places.
+    - `arrays`: along the places.
 
     **Returns:** the same arrays, `[places, *rows, pixels]`.
     """
 
     return map_chunks(
-        lambda *given: jax.tree.map(_by_place, function(*given)),
-        *given,
+        lambda *chunks: jax.tree.map(_by_place, function(*chunks)),
+        *arrays,
         at_once=_splatting.TILES_AT_ONCE,
     )
 
