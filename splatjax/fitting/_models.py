@@ -107,10 +107,10 @@ def weight_factors(
     """
     weights, rule = np.asarray(gaussians.weights), TransportModel.rule
     held, factors = NonNegativeWeights(FixedTotalReflectance()), np.ones_like(weights)
-    for channel, own in enumerate((weights > 0).T):
+    for channel, used in enumerate((weights > 0).T):
         profile = SumOfGaussians(other.variances, other.weights[:, channel, None])
-        fitted = fit_weights(profile, gaussians.variances[own], weights=held, rule=rule).weights
-        factors[own, channel] = fitted[:, 0] / weights[own, channel]
+        fitted = fit_weights(profile, gaussians.variances[used], weights=held, rule=rule).weights
+        factors[used, channel] = fitted[:, 0] / weights[used, channel]
     return jnp.asarray(factors)
 
 

@@ -204,10 +204,10 @@ class FitProblem(eqx.Module):
         follow = jnp.concatenate(
             [jnp.diag(variances), (moved * scale[..., None]).reshape(channels * count, count)]
         )
-        own = jax.scipy.linalg.block_diag(
+        linear = jax.scipy.linalg.block_diag(
             jnp.zeros_like(normal), *(response * scale[..., None] * scale[:, None, :])
         )
-        covariance = jnp.sum(squared) * (follow @ invert_moving(normal) @ follow.T + own)
+        covariance = jnp.sum(squared) * (follow @ invert_moving(normal) @ follow.T + linear)
         # The variance of a Gaussian without weight in any channel is unknown.
         idle = jnp.append(jnp.diagonal(normal) == 0, jnp.zeros(channels * count, bool))
         unknown = jnp.diag(jnp.where(idle, jnp.inf, 0.0).astype(covariance.dtype))

@@ -31,12 +31,12 @@ def invert(matrix: Float[Array, "columns columns"]) -> Float[Array, "columns col
     """Invert a positive definite matrix by Gauss and Jordan's elimination, without pivoting."""
 
     def eliminate(column, matrix):
-        here = jnp.arange(matrix.shape[0]) == column
+        is_column = jnp.arange(matrix.shape[0]) == column
         # The unit vector replaces the column, and becomes that of the inverse.
-        replaced = jnp.where(here[None], here[:, None].astype(matrix.dtype), matrix)
+        replaced = jnp.where(is_column[None], is_column[:, None].astype(matrix.dtype), matrix)
         row = replaced[column] / matrix[column, column]
         reduced = replaced - matrix[:, column][:, None] * row[None]
-        return jnp.where(here[:, None], row[None], reduced)
+        return jnp.where(is_column[:, None], row[None], reduced)
 
     return jax.lax.fori_loop(0, matrix.shape[0], eliminate, matrix)
 

@@ -134,8 +134,8 @@ class HalfSpace(eqx.Module):
 
         **Raises:** `ValueError` for a number out of its range.
         """
-        given = [jnp.atleast_1d(as_floats(each)) for each in (color, mean_free_path, eta, g)]
-        color, mean_free_path, eta, g = jnp.broadcast_arrays(*given)
+        arrays = [jnp.atleast_1d(as_floats(value)) for value in (color, mean_free_path, eta, g)]
+        color, mean_free_path, eta, g = jnp.broadcast_arrays(*arrays)
         check_values("color", color, "between 0.001 and 1", lambda x: (x >= 1e-3) & (x <= 1))
         check_values("mean_free_path", mean_free_path, "positive (mm)", lambda x: x > 0)
         absorbed = jax.vmap(_similarity_of_color)(color, eta, g) ** 2  # 1 - albedo'
@@ -200,15 +200,15 @@ def _similarity_of_color(
     linear.
     """
 
-    def excess(similarity, given):
-        color, eta, g, white = given
+    def excess(similarity, constants):
+        color, eta, g, white = constants
         return _diffuse_albedo(1 - similarity * similarity, eta, g) / white - color
 
     # White is 1 to rounding.
-    given = color, eta, g, _diffuse_albedo(jnp.ones_like(color), eta, g)
+    constants = color, eta, g, _diffuse_albedo(jnp.ones_like(color), eta, g)
     ends = {"lower": jnp.zeros_like(color), "upper": jnp.full_like(color, 1 - 1e-6)}
     solver, start = optx.Bisection(rtol=0, atol=0), 0.5 * ends["upper"]
-    root = optx.root_find(excess, solver, start, given, ends, max_steps=_HALVINGS, throw=False)
+    root = optx.root_find(excess, solver, start, constants, ends, max_steps=_HALVINGS, throw=False)
     return root.value
 
 
@@ -272,7 +272,7 @@ def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
 
 def _diffuse_albedo(albedo_prime, eta, g, cover=None) -> Float[Array, ""]:
     """Compute the fraction that leaves of diffuse light that has entered."""
-    mu, weights, reflected = (each[: _OUTSIDE + 1] for each in _directions(eta))
+    mu, weights, reflected = (values[: _OUTSIDE + 1] for values in _directions(eta))
     entering = mu * weights * (1 - reflected)
     return jnp.vdot(entering, _directional_albedo(albedo_prime, eta, g, cover)) / jnp.sum(entering)
 
@@ -284,7 +284,7 @@ def _directions(eta: Float[Array, ""]):
     nodes, node_weights = unit_legendre(_OUTSIDE)
     outside = jnp.asarray(HalfSpace.cosines(), eta.dtype)
     outside_weights = jnp.asarray(np.append(2 * nodes * node_weights, 0), eta.dtype)
-    beyond, beyond_weights = (jnp.asarray(each, eta.dtype) for each in unit_legendre(_BEYOND))
+    beyond, beyond_weights = (jnp.asarray(values, eta.dtype) for values in unit_legendre(_BEYOND))
     squared = eta * eta
     inside = jnp.sqrt(jnp.maximum(squared - 1 + outside * outside, _LEAST_COSINE**2)) / eta
     is_denser = squared > 1

@@ -256,7 +256,7 @@ def _over_reflections(ratio: Float[Array, " channels"], factor) -> Float[Array, 
     """
     normal = ((ratio - 1) / (ratio + 1))[None]
     b = 2 * normal / (1 + normal * normal)
-    x, _, weights = (jnp.asarray(each, ratio.dtype)[:, None] for each in unit_interval())
+    x, _, weights = (jnp.asarray(values, ratio.dtype)[:, None] for values in unit_interval())
     s = normal + (1 - normal) * x
     along = (s - b) / (s * (1 - b * s))
     integrand = (1 - normal) * (1 - s * s) * (1 + along * along) * factor(s)

@@ -77,14 +77,14 @@ class RadialRule(AbstractRadialRule):
         A measured profile has its own radii; those outside of the rule have weight 0.
         """
         scale = jax.lax.stop_gradient(profile.length_scale())
-        known = jax.lax.stop_gradient(profile.known_radii())
-        nodes = known or _nodes(self.smallest, self.largest, self.count, self.near)
+        measured = jax.lax.stop_gradient(profile.known_radii())
+        nodes = measured or _nodes(self.smallest, self.largest, self.count, self.near)
         shape = (*nodes[0].shape, *scale.shape)
         radii, weights = (
             jnp.broadcast_to(jnp.asarray(values, scale.dtype)[:, None], shape) for values in nodes
         )
         scale = jnp.broadcast_to(scale, shape)
-        if known is None:
+        if measured is None:
             return radii * scale, weights * scale * radii**self.tail
         first = 0.0 if self.near else self.smallest
         inside = (radii >= first * scale) & (radii <= self.largest * scale)
@@ -134,8 +134,8 @@ class InverseVariance(AbstractRadialRule):
                 "values, deviation) and monte_carlo(...).profile() have"
             )
         r, dr = self.among.radii(profile)
-        known = (dr > 0) & (deviation > 0) & (r > 0)
-        return r, jnp.where(known, 1 / jnp.where(known, deviation * deviation * r, 1.0), 0.0)
+        usable = (dr > 0) & (deviation > 0) & (r > 0)
+        return r, jnp.where(usable, 1 / jnp.where(usable, deviation * deviation * r, 1.0), 0.0)
 
 
 @functools.cache

@@ -217,7 +217,7 @@ class Skin(eqx.Module):
         melanin = self.eumelanin * pure["eumelanin"] + (1 - self.eumelanin) * pure["pheomelanin"]
         oxygenation = self.oxygenation
         blood = oxygenation * pure["oxygenated"] + (1 - oxygenation) * pure["deoxygenated"]
-        other = self.water * pure["water"] + self.carotene * pure["carotene"]
+        water_and_carotene = self.water * pure["water"] + self.carotene * pure["carotene"]
         epidermis = self.melanin * melanin + (1 - self.melanin) * pure["baseline"]
         blood = blood * mean_decay(2 * self.vessel_radius * blood)
         dermis = self.blood * blood + (1 - self.blood) * pure["baseline"]
@@ -225,8 +225,8 @@ class Skin(eqx.Module):
         eta = jnp.broadcast_to(self.eta, sigma_s_prime.shape)
         bilirubin = self.bilirubin * pure["bilirubin"]
         return (
-            Medium(epidermis + other, sigma_s_prime, eta),
-            Medium(dermis + other + bilirubin, sigma_s_prime, eta),
+            Medium(epidermis + water_and_carotene, sigma_s_prime, eta),
+            Medium(dermis + water_and_carotene + bilirubin, sigma_s_prime, eta),
         )
 
     def layers(self) -> tuple[Layer, Layer]:

@@ -56,8 +56,8 @@ def diffuse_transmittance(optical_depth: Float[Array, "*shape"]) -> Float[Array,
     derivative -2.
     """
     mu, _, weights = (
-        jnp.asarray(each, optical_depth.dtype).reshape(-1, *[1] * optical_depth.ndim)
-        for each in unit_interval()
+        jnp.asarray(values, optical_depth.dtype).reshape(-1, *[1] * optical_depth.ndim)
+        for values in unit_interval()
     )
     return jnp.sum(2 * weights * mu * jnp.exp(-optical_depth[None] / mu), axis=0)
 
@@ -97,8 +97,8 @@ def slab_response(
     )
     lengths = depth, above, below, thickness - depth, thickness + above + below
     albedo, squared_sigma_tr, depth, above, below, beneath, height = (
-        jnp.broadcast_to(each, k.shape)
-        for each in (medium.albedo_prime, medium.squared_sigma_tr, *lengths)
+        jnp.broadcast_to(values, k.shape)
+        for values in (medium.albedo_prime, medium.squared_sigma_tr, *lengths)
     )
     u = squared_sigma_tr + k * k
 

@@ -169,7 +169,7 @@ def measure_laser_dot(
     y, x = np.mgrid[:height, :width] + 0.5
     light = pixels.sum(axis=2)
     core = np.where(light > _CORE * light.max(), light, 0.0)
-    centroid = [float((core * each).sum() / core.sum()) for each in (x, y)]
+    centroid = [float((core * coordinate).sum() / core.sum()) for coordinate in (x, y)]
     x0, y0 = centroid if center is None else center
     inside = min(x0, y0, width - x0, height - y0)
     if not inside > 0:

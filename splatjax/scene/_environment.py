@@ -135,13 +135,13 @@ class EnvironmentLight(AbstractExtendedLight):
         """Distribute the moments of every pixel to the given directions near it, by Gaussians half
         as wide as the spacing of the directions.
         """
-        given = self.directions / jnp.linalg.norm(self.directions, axis=1, keepdims=True)
-        given = given @ self.to_world()
-        concentration = len(given) / jnp.pi  # over the squared angle
+        samples = self.directions / jnp.linalg.norm(self.directions, axis=1, keepdims=True)
+        samples = samples @ self.to_world()
+        concentration = len(samples) / jnp.pi  # over the squared angle
 
         def of_row(row):
             towards, moments = row
-            shares = jax.nn.softmax(concentration * towards @ given.T, axis=1)
+            shares = jax.nn.softmax(concentration * towards @ samples.T, axis=1)
             return shares.T @ moments
 
         return jnp.sum(jax.lax.map(of_row, (directions, moments)), axis=0)
@@ -276,8 +276,8 @@ def prefilter(
         lobe = jnp.exp((cosine - 1) / ((1 + cosine) * roughness**2)) * jnp.maximum(cosine, 0)
         kernel = jnp.real(jnp.fft.rfft(lobe / (1 + cosine) ** 3, axis=2))
         blurred = jnp.einsum("rsf,sfk->rfk", kernel.astype(spectrum.dtype), spectrum)
-        whole = kernel[:, :, 0] @ solid_angles[:, 0]
-        return jnp.fft.irfft(blurred, axis=1) / whole[:, None, None]
+        mass = kernel[:, :, 0] @ solid_angles[:, 0]
+        return jnp.fft.irfft(blurred, axis=1) / mass[:, None, None]
 
     # The barrier prevents constant folding: the compiler would otherwise compute all kernels.
     maps = jax.lax.map(blur, jax.lax.optimization_barrier(jnp.asarray(_ROUGHNESSES, dtype)))

@@ -83,8 +83,8 @@ class Material(eqx.Module):
         """Return `angles`, or the law of value 1 at every angle, with the powers of `HalfSpace`."""
         if self.angles is not None:
             return self.angles
-        one = np.eye(ANGULAR_POWERS, 1, dtype=self.gaussians.weights.dtype)
-        return AngularLaw(jax.device_put(one.repeat(self.channels, 1)))
+        constant = np.eye(ANGULAR_POWERS, 1, dtype=self.gaussians.weights.dtype)
+        return AngularLaw(jax.device_put(constant.repeat(self.channels, 1)))
 
     def diffuse_fraction(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         """Compute the factor on the Gaussians for light that enters at the cosine `mu_i`; 1 along

@@ -86,19 +86,19 @@ class Camera(eqx.Module):
         eye, target, up = points
         forward = target - eye
         if not isinstance(points, Tracer):
-            known, way = np.asarray(points, np.float64), np.asarray(forward, np.float64)
+            checked, way = np.asarray(points, np.float64), np.asarray(forward, np.float64)
             check_values(
                 "eye, target and up",
-                known,
+                checked,
                 f"finite and below {_FARTHEST:g} mm",
                 lambda x: np.abs(x) < _FARTHEST,
             )
             if not np.linalg.norm(way) > 0:
-                raise ValueError(f"eye and target are both {known[0].tolist()}; move one of them")
-            smallest = _PARALLEL * np.linalg.norm(way) * np.linalg.norm(known[2])
-            if not np.linalg.norm(np.cross(way, known[2])) > smallest:
+                raise ValueError(f"eye and target are both {checked[0].tolist()}; move one of them")
+            smallest = _PARALLEL * np.linalg.norm(way) * np.linalg.norm(checked[2])
+            if not np.linalg.norm(np.cross(way, checked[2])) > smallest:
                 raise ValueError(
-                    f"up is {known[2].tolist()}, along the line of sight; give another, such as "
+                    f"up is {checked[2].tolist()}, along the line of sight; give another, such as "
                     "[0, 0, -1] to look down"
                 )
         rotation = rotation_towards(forward / jnp.linalg.norm(forward), up)

@@ -59,10 +59,10 @@ def average_transmission(
     **Returns:** with the channels of `angles` as first axis.
     """
     reflected = average_albedo(f0, roughness, angles.coefficients)
-    whole = angles.coefficients.T @ jnp.asarray(
+    total = angles.coefficients.T @ jnp.asarray(
         [2 / (2 + power) for power in range(len(angles.coefficients))], reflected.dtype
     )
-    return whole.reshape(-1, *[1] * roughness.ndim) - reflected
+    return total.reshape(-1, *[1] * roughness.ndim) - reflected
 
 
 class SurfacePoints(eqx.Module):

@@ -251,5 +251,5 @@ def average_albedo(
     """
     series = factor.T @ _with_fresnel(_tables()[1][:, : len(factor)], f0)
     along = roughness.reshape(-1)
-    averages = map_chunks(lambda each: (series @ _roughness_basis(each)).T, along, at_once=_AT_ONCE)
+    averages = map_chunks(lambda part: (series @ _roughness_basis(part)).T, along, at_once=_AT_ONCE)
     return averages.T.reshape(-1, *roughness.shape)

@@ -62,7 +62,7 @@ class LayeredMedia(eqx.Module):
         thin = _FILM_THICKNESS / jax.lax.stop_gradient(scattering[0].medium.sigma_s_prime)
         rows = []
         for number, layer in enumerate(layers):
-            lower = [other for other in layers[number:] if isinstance(other, Layer)]
+            lower = [candidate for candidate in layers[number:] if isinstance(candidate, Layer)]
             medium = (lower or scattering[-1:])[0].medium
             if isinstance(layer, Film):
                 rows.append((layer.optical_depth / thin, jnp.zeros_like(like), thin, medium.eta))
@@ -248,9 +248,9 @@ def _walk_of(
     absorption = sigma_a * unit[None]
     # Slopes in the absorption of each layer, and in the scattering of each.
     layers = len(sigma_a)
-    own = jnp.broadcast_to(jnp.eye(layers, dtype=unit.dtype)[..., None], (layers, *sigma_a.shape))
-    length, none = own * unit[None, None], jnp.zeros_like(own)
-    ratio = own / jnp.where(sigma_s > 0, sigma_s, jnp.inf)[None]
+    eye = jnp.broadcast_to(jnp.eye(layers, dtype=unit.dtype)[..., None], (layers, *sigma_a.shape))
+    length, none = eye * unit[None, None], jnp.zeros_like(eye)
+    ratio = eye / jnp.where(sigma_s > 0, sigma_s, jnp.inf)[None]
     slopes = Optics(*map(jnp.concatenate, ([length, none], [length, length], [none, ratio])))
     return Walk(
         settings=settings,

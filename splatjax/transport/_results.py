@@ -38,8 +38,8 @@ class Sum(eqx.Module):
             (term - high) + self.high,
         )
         low = self.low + lost
-        both = high + low
-        return Sum(both, low - (both - high))
+        rounded = high + low
+        return Sum(rounded, low - (rounded - high))
 
     def over(self, count) -> Float[Array, "..."]:
         """Compute the mean."""
@@ -164,13 +164,13 @@ def assemble(
     specular: Float[Array, " channels"],
 ) -> MonteCarlo:
     """Turn means of weights and of their squares into results; errors are constants."""
-    rings, others = edges.shape[0] - 1, (photons - 1).astype(edges.dtype)
+    rings, divisor = edges.shape[0] - 1, (photons - 1).astype(edges.dtype)
     areas = jnp.pi * (edges[1:] ** 2 - edges[:-1] ** 2)
     borders = [rings + 1, 2 * rings + 2, 2 * rings + 3]
     above, below, unfinished, absorbed = jnp.split(moments, borders, axis=1)
 
     def mean(moments: Float[Array, "*shape two"]) -> SampleMean:
-        variance = jax.lax.stop_gradient(moments[..., 1] - moments[..., 0] ** 2) / others
+        variance = jax.lax.stop_gradient(moments[..., 1] - moments[..., 0] ** 2) / divisor
         return SampleMean(moments[..., 0].T, jnp.sqrt(jnp.maximum(variance, 0.0)).T)
 
     def by_area(moments: Float[Array, "channels rings two"]) -> SampleMean:

@@ -57,7 +57,7 @@ class DiffuseIncidence(AbstractIncidence):
     """Uniform radiance from all directions above: a white sky."""
 
     def enter(self, xi_cosine, xi_angle, eta):
-        outside, inside = (jnp.broadcast_to(each, xi_cosine.shape) for each in eta)
+        outside, inside = (jnp.broadcast_to(index, xi_cosine.shape) for index in eta)
         reflectance, cosine = fresnel(jnp.sqrt(xi_cosine), outside, inside)
         sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0.0))
         weight = (1 - reflectance) / jnp.broadcast_to(
@@ -116,8 +116,8 @@ def of_layer(
     shape = (*table.shape[1:], *layer.shape)
     entry = jnp.broadcast_to(table[0][..., None], shape)
     for number in range(1, table.shape[0]):
-        here = jnp.broadcast_to(layer == number, shape)
-        entry = jnp.where(here, jnp.broadcast_to(table[number][..., None], shape), entry)
+        is_in_layer = jnp.broadcast_to(layer == number, shape)
+        entry = jnp.where(is_in_layer, jnp.broadcast_to(table[number][..., None], shape), entry)
     return entry
 
 
@@ -210,7 +210,7 @@ def scatter(
         (1 + g * s) * (1 + g * s)
     )
     sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0.0))
-    along, across = (sine * each for each in on_circle(xi_angle))
+    along, across = (sine * coordinate for coordinate in on_circle(xi_angle))
     # An orthonormal basis about the direction (Duff et al. 2017).
     sign = jnp.where(z < 0, -jnp.ones_like(z), jnp.ones_like(z))
     a = -1 / (sign + z)
@@ -299,8 +299,8 @@ def weigh(
         jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None],
         weights.absorbed.shape,
     )
-    here = jnp.broadcast_to(layer, layers.shape) == layers
+    is_in_layer = jnp.broadcast_to(layer, layers.shape) == layers
     return PathWeights(
         weights.carried * jnp.exp(-removal) * ratio,
-        weights.absorbed + jnp.where(here, jnp.broadcast_to(taken, here.shape), 0.0),
+        weights.absorbed + jnp.where(is_in_layer, jnp.broadcast_to(taken, is_in_layer.shape), 0.0),
     )
