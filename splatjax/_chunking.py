@@ -135,7 +135,7 @@ def needed_over_planned(needed: Int[Array, ""], planned: int) -> Float[Array, ""
     return jnp.where(needed > planned, jnp.maximum(ratio, 1 + jnp.finfo(ratio.dtype).eps), ratio)
 
 
-def zeros_after(known: PyTree[Array], shape: tuple[int, ...], dtype: DTypeLike) -> Array:
+def zeros_after(inputs: PyTree[Array], shape: tuple[int, ...], dtype: DTypeLike) -> Array:
     r"""Return zeros for a loop to write into, allocated only after other arrays are known.
 
     A compiler allocates constants early and keeps one copy for all loops that begin with them;
@@ -144,10 +144,10 @@ def zeros_after(known: PyTree[Array], shape: tuple[int, ...], dtype: DTypeLike) 
 
     **Arguments:**
 
-    - `known`: the last inputs of the loop to be computed; at least one element in all.
+    - `inputs`: the last inputs of the loop to be computed; at least one element in all.
     - `shape`, `dtype`: of the zeros.
     """
-    first = [leaf.reshape(-1)[0] > 0 for leaf in jax.tree.leaves(known) if leaf.size]
+    first = [leaf.reshape(-1)[0] > 0 for leaf in jax.tree.leaves(inputs) if leaf.size]
     # Always 0, which the compiler cannot infer.
     zero = jnp.minimum(jnp.stack(first).astype(jnp.int32).sum(), 0)
     return jnp.full(shape, zero.astype(dtype))

@@ -70,12 +70,12 @@ class DeviceMesh(AbstractCombination):
         return PartitionSpec(self.axes)
 
     def total(self, partials):
-        (own,) = partials
-        return jax.lax.psum(own, self.axes)
+        (part,) = partials
+        return jax.lax.psum(part, self.axes)
 
     def largest(self, partials):
-        (own,) = partials
-        return jax.tree.map(lambda leaf: jax.lax.pmax(jax.lax.stop_gradient(leaf), self.axes), own)
+        (part,) = partials
+        return jax.tree.map(lambda leaf: jax.lax.pmax(jax.lax.stop_gradient(leaf), self.axes), part)
 
     def own_share(self, rows):
         return jax.lax.psum_scatter(rows, self.axes, scatter_dimension=0, tiled=True)
@@ -101,12 +101,12 @@ class PartByPart(AbstractCombination):
         return self._combine(jnp.maximum, partials)
 
     def _combine(self, operation: Callable[[Array, Array], Array], partials: Iterable[Partial]):
-        others = iter(partials)
-        return self.fold(functools.partial(jax.tree.map, operation), next(others), others)
+        remaining = iter(partials)
+        return self.fold(functools.partial(jax.tree.map, operation), next(remaining), remaining)
 
     def fold(self, add, start, parts):
         # Wait, because parts that are read ahead of the computation would accumulate.
-        return functools.reduce(lambda *given: jax.block_until_ready(add(*given)), parts, start)
+        return functools.reduce(lambda *pair: jax.block_until_ready(add(*pair)), parts, start)
 
 
 def extreme(

@@ -86,11 +86,11 @@ def record(cls: Class) -> Class:
 
     def __init__(self, *args, **kwargs):
         try:
-            given = signature.bind(*args, **kwargs)
+            bound = signature.bind(*args, **kwargs)
         except TypeError as error:
             raise TypeError(f"{error}; give {_call(cls)}") from None
-        given.apply_defaults()
-        values, records = given.arguments, []
+        bound.apply_defaults()
+        values, records = bound.arguments, []
         for name in linear:
             if jnp.issubdtype(getattr(values[name], "dtype", float), jnp.integer):
                 raise ValueError(
@@ -113,9 +113,9 @@ def record(cls: Class) -> Class:
             check_values(f"{cls.__name__}.{name}", getattr(self, name), *requirement)
 
     # No annotations here: runtime type checkers would refuse arguments before their conversion.
-    own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    others = [part.replace(annotation=part.empty) for part in signature.parameters.values()]
-    __init__.__signature__ = inspect.Signature([own, *others])  # ty: ignore[missing-attribute]
+    receiver = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    fields = [part.replace(annotation=part.empty) for part in signature.parameters.values()]
+    __init__.__signature__ = inspect.Signature([receiver, *fields])  # ty: ignore[missing-attribute]
     cls.__init__ = __init__  # ty: ignore[invalid-assignment]
     return cls
 
@@ -167,13 +167,13 @@ def check_values(
     def is_good(entries):
         return holds(entries) & (np.isfinite(entries) if finite else ~np.isnan(entries))
 
-    known = np.asarray(values)
-    if not np.all(is_good(np.stack([known.min(), known.max()]))):
-        good = is_good(known)
+    array = np.asarray(values)
+    if not np.all(is_good(np.stack([array.min(), array.max()]))):
+        good = is_good(array)
         place = tuple(np.argwhere(~good)[0].tolist())
-        found = f"{np.sum(~good)} of {known.size} entries are not; the first is" if place else "got"
+        fault = f"{np.sum(~good)} of {array.size} entries are not; the first is" if place else "got"
         raise ValueError(
-            f"{name} must be {requirement}; {found} {known[place]:g}"
+            f"{name} must be {requirement}; {fault} {array[place]:g}"
             f"{f' at {list(place)}' if place else ''}"
         )
 
@@ -183,18 +183,18 @@ _RECORDS = (eqx.Module, NoneType)
 
 def _is_placeholder(value: Any) -> bool:
     """Return whether a value is `None` or an object of JAX that stands for an array or a record."""
-    known = bool | int | float | complex | str | list | tuple | eqx.Module
-    return not isinstance(value, known) and not hasattr(value, "__array__")
+    convertible = bool | int | float | complex | str | list | tuple | eqx.Module
+    return not isinstance(value, convertible) and not hasattr(value, "__array__")
 
 
 def _converted(
     record: str, axes: dict[str, list[str]], values: dict[str, Any], records: list
 ) -> dict[str, Array]:
     """Convert the values of all fields of numbers."""
-    given = {name: values[name] for name in axes if not _is_placeholder(values[name])}
-    precision = _precision([records, list(given.values())])
+    inputs = {name: values[name] for name in axes if not _is_placeholder(values[name])}
+    precision = _precision([records, list(inputs.values())])
     arrays = {
-        name: as_floats(value, precision, f"{record}.{name}") for name, value in given.items()
+        name: as_floats(value, precision, f"{record}.{name}") for name, value in inputs.items()
     }
     channels = [part.channels for part in records if hasattr(part, "channels")]
     lengths = {"channels": channels[0]} if channels else {}
@@ -218,8 +218,8 @@ def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) 
     required = [int(axis) if axis.isdigit() else lengths.get(axis, axis) for axis in axes]
     # A string is an axis whose length no other field gives.
     matches = [
-        own == length or isinstance(length, str)
-        for own, length in zip(array.shape, required, strict=False)
+        actual == length or isinstance(length, str)
+        for actual, length in zip(array.shape, required, strict=False)
     ]
     if array.ndim != len(axes) or not all(matches):
         raise ValueError(

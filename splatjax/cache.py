@@ -83,16 +83,16 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
             jax.config.update(name, value)
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
     base = base if base.is_absolute() else Path.home() / ".cache"
-    whole = Path(folder or base / "splatjax" / "jax").absolute() / _processor()
-    kept_folder = whole / "kept"
+    cache_folder = Path(folder or base / "splatjax" / "jax").absolute() / _processor()
+    kept_folder = cache_folder / "kept"
     kept_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if jax.config.jax_compilation_cache_dir is None:  # ty: ignore[missing-attribute]
-        jax.config.update("jax_compilation_cache_dir", str(whole))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder))
     if not _is_private(kept_folder):  # or the system does not show whose it is
         raise PermissionError(f"{kept_folder}: other users may write to this folder; delete it")
     _source()  # now, since files may change while the program runs
     _folder = kept_folder
-    return whole
+    return cache_folder
 
 
 def reuse_capacity(kind: Hashable, least: int, capacity: int, most: float = 1.25) -> int:
@@ -210,8 +210,8 @@ def _path(function: Any, arguments: Any, *, by_values: bool) -> Path | None:
 def _kinds(structure: PyTreeDef) -> list[str]:
     """Return the classes of the nodes of a tree."""
     node = structure.node_data()
-    own = [] if node is None else [f"{node[0].__module__}.{node[0].__qualname__}"]
-    return own + [kind for child in structure.children() for kind in _kinds(child)]
+    kinds = [] if node is None else [f"{node[0].__module__}.{node[0].__qualname__}"]
+    return kinds + [kind for child in structure.children() for kind in _kinds(child)]
 
 
 @functools.cache
@@ -266,8 +266,8 @@ def _write(path: Path, content: Any) -> Any:
             file.flush()
             os.replace(file.name, path)  # so that there is nothing to delete in the end
         total = 0
-        for each in sorted(path.parent.iterdir(), key=lambda each: -each.stat().st_mtime):
-            total += each.stat().st_size
+        for entry in sorted(path.parent.iterdir(), key=lambda entry: -entry.stat().st_mtime):
+            total += entry.stat().st_size
             if total > _LARGEST:
-                each.unlink(missing_ok=True)
+                entry.unlink(missing_ok=True)
     return content

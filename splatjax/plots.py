@@ -81,10 +81,10 @@ def plot_fit(
     for channel, color in enumerate(_colors(len(error))):
         held = "held" if abs(energy[channel]) < _HELD else f"{energy[channel]:+.2e}"
         label = f"{names[channel]}: E = {error[channel]:.2e}, energy {held}"
-        given = reference[:, channel]
-        linear.plot(radii, radii * given, color=color, alpha=0.35, linewidth=width, marker=marker)
+        values = reference[:, channel]
+        linear.plot(radii, radii * values, color=color, alpha=0.35, linewidth=width, marker=marker)
         linear.plot(between, between * of_fit[:, channel], color=color, linewidth=1.2, label=label)
-        log.loglog(radii, given, color=color, alpha=0.35, linewidth=width, marker=marker)
+        log.loglog(radii, values, color=color, alpha=0.35, linewidth=width, marker=marker)
         log.loglog(between, of_fit[:, channel], color=color, linewidth=1.2)
         residual.semilogx(radii, left[:, channel], color=color, linewidth=1.2, marker=marker)
 
@@ -102,7 +102,7 @@ def plot_fit(
     residual.set(xlabel="r (mm)", ylabel="fit / R - 1", xlim=ends)
     residual.set_title("relative error, to a hundredth of the light's density", fontsize="medium")
     if not rule.reaches_origin:
-        nodes, weights = (np.asarray(each) for each in rule.radii(profile))
+        nodes, weights = (np.asarray(values) for values in rule.radii(profile))
         begin = float(nodes[weights > 0].min())
         for axes in (log, residual):
             axes.axvspan(ends[0], begin, color="0.93", zorder=0)
@@ -125,9 +125,9 @@ def plot_fit(
 def _radii(profile: AbstractProfile) -> Float[Array, " radii"]:
     """Those of a measured profile; else from a hundredth of the smallest length scale to where
     every channel has fallen to the tail."""
-    known = profile.known_radii()
-    if known is not None:
-        return known[0][known[0] > 0]
+    measured = profile.known_radii()
+    if measured is not None:
+        return measured[0][measured[0] > 0]
     scale = profile.length_scale()
     least, most = 0.02 * scale.min(), 1e3 * scale.max()
     r = jnp.geomspace(least, most, 4 * _POINTS, dtype=scale.dtype)
