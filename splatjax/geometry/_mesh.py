@@ -47,7 +47,7 @@ class Mesh(eqx.Module):
 
     def select(self, keep) -> "Mesh":
         """Return the mesh of the chosen faces (a mask or indices), with all vertices."""
-        uvs, parts = (None if each is None else each[keep] for each in (self.uvs, self.parts))
+        uvs, parts = (None if rows is None else rows[keep] for rows in (self.uvs, self.parts))
         return Mesh(self.vertices, self.faces[keep], self.normals, uvs, self.colors, parts)
 
 
@@ -84,8 +84,8 @@ def shared_edges(places: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "n 2 2"]
     starts, ends = places[:, [1, 2, 0]].ravel(), places[:, [2, 0, 1]].ravel()
     key = np.minimum(starts, ends) * np.int64(places.max(initial=0) + 1) + np.maximum(starts, ends)
     order = np.argsort(key, kind="stable")
-    same = key[order][1:] == key[order][:-1]
-    edges = np.stack([order[:-1][same], order[1:][same]], axis=1)
+    paired = key[order][1:] == key[order][:-1]
+    edges = np.stack([order[:-1][paired], order[1:][paired]], axis=1)
     first, second = (edges - edges % 3 + (edges % 3 + step) % 3 for step in (1, 2))
     turned = places.ravel()[first[:, 0]] != places.ravel()[first[:, 1]]
     first[turned, 1], second[turned, 1] = second[turned, 1], first[turned, 1]
@@ -144,10 +144,10 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
     replaced[mesh.faces[off]] = True
     if not replaced[mesh.faces].any():
         return mesh
-    one, other = np.moveaxis(shared_edges(distinct(mesh.vertices)[1][mesh.faces]), 2, 0)
-    soft = np.einsum("ni,ni->n", facing[one[:, 0] // 3], facing[other[:, 0] // 3]) >= cosine
+    left, right = np.moveaxis(shared_edges(distinct(mesh.vertices)[1][mesh.faces]), 2, 0)
+    soft = np.einsum("ni,ni->n", facing[left[:, 0] // 3], facing[right[:, 0] // 3]) >= cosine
     links = scipy.sparse.coo_array(
-        (np.ones(2 * soft.sum()), (one[soft].ravel(), other[soft].ravel())),
+        (np.ones(2 * soft.sum()), (left[soft].ravel(), right[soft].ravel())),
         shape=(mesh.faces.size,) * 2,
     )
     groups = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
@@ -182,18 +182,18 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
     tip_above = count[split] == 1
     is_tip = is_above[split] == tip_above[:, None]
     turn = (is_tip.argmax(axis=1)[:, None] + np.arange(3)) % 3
-    tip, one, other = np.moveaxis(np.eye(3)[turn], 1, 0)
+    tip, left, right = np.moveaxis(np.eye(3)[turn], 1, 0)
     # Symmetric in the ends of an edge, so that neighbors cut the edge between them alike.
     off_tip, *off_ends = np.abs(np.take_along_axis(y[split], turn, axis=1)).T[..., None]
     first, second = (
         (off_end * tip + off_tip * end) / (off_end + off_tip)
-        for end, off_end in zip((one, other), off_ends, strict=True)
+        for end, off_end in zip((left, right), off_ends, strict=True)
     )
     # What stays of a split triangle: its tip, or the two triangles below it.
     pieces = [
         (tip_above, (tip, first, second)),
-        (~tip_above, (first, one, other)),
-        (~tip_above, (first, other, second)),
+        (~tip_above, (first, left, right)),
+        (~tip_above, (first, right, second)),
     ]
     cut = mesh.select(np.concatenate([whole, *(split[stays] for stays, _ in pieces)]))
     shares = [np.stack(corners, axis=1)[stays] for stays, corners in pieces]
@@ -203,7 +203,7 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
         return None if values is None else np.einsum("fkc,fci->fki", share, values)
 
     vertices, normals = (
-        at_corners(each[cut.faces]).reshape(-1, 3) for each in (mesh.vertices, mesh.normals)
+        at_corners(rows[cut.faces]).reshape(-1, 3) for rows in (mesh.vertices, mesh.normals)
     )
     colors = None if mesh.colors is None else at_corners(mesh.colors[cut.faces]).reshape(-1, 3)
     numbers = np.arange(cut.faces.size).reshape(-1, 3)

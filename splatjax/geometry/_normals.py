@@ -49,11 +49,11 @@ def estimate_normals(
     normals = np.empty(places.shape)
     for start in range(0, len(places), _CHUNK):
         part = slice(start, start + _CHUNK)
-        ways, those = planes[near[part]], near[part]
-        beyond = np.einsum("nki,nki->nk", ways, places[part, None] - middles[those]) ** 2
+        ways, indices = planes[near[part]], near[part]
+        beyond = np.einsum("nki,nki->nk", ways, places[part, None] - middles[indices]) ** 2
         share = (
             1
-            / ((off[those] + beyond) / np.maximum(size[part, None], np.finfo(float).tiny) + _FLAT)
+            / ((off[indices] + beyond) / np.maximum(size[part, None], np.finfo(float).tiny) + _FLAT)
             ** 2
         )
         best = np.take_along_axis(ways, share.argmax(axis=1)[:, None, None], axis=1)
@@ -79,11 +79,11 @@ def _planes(
         shares = (1 - (distances[part] / np.where(reach > 0, _BEYOND * reach, 1)) ** 2)[
             ..., None
         ] ** 2
-        whole = shares.sum(axis=1)
-        middles[part] = (shares * around).sum(axis=1) / whole
+        total = shares.sum(axis=1)
+        middles[part] = (shares * around).sum(axis=1) / total
         around = around - middles[part, None]
         variances, ways = np.linalg.eigh((shares * around).swapaxes(1, 2) @ around)
-        normals[part], off[part] = ways[..., 0], np.maximum(variances[:, 0], 0) / whole[:, 0]
+        normals[part], off[part] = ways[..., 0], np.maximum(variances[:, 0], 0) / total[:, 0]
     return middles, normals, off
 
 
@@ -126,9 +126,9 @@ def outward_signs(
     """
     votes, cast = _votes(points, normals, 0.6 * float(np.quantile(reaches, 0.99)))
     around, cast_around = votes.copy(), cast.copy()
-    for each in near.T:
-        around += votes[each] * np.sign(np.einsum("ni,ni->n", normals, normals[each]))
-        cast_around += cast[each]
+    for neighbor in near.T:
+        around += votes[neighbor] * np.sign(np.einsum("ni,ni->n", normals, normals[neighbor]))
+        cast_around += cast[neighbor]
     sure = np.abs(around) > _SURE * (cast_around + _DOUBT * (1 + near.shape[1]))
     signs, patches = _carried(
         points, normals, near, np.flatnonzero(sure), np.where(around < 0, -1.0, 1.0)
@@ -157,7 +157,8 @@ def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs
     for frame in frames:
         across, up, towards = frame @ single.T
         columns, rows = (
-            np.floor((each - each.min()) / pixel).astype(np.int64) for each in (across, up)
+            np.floor((coordinates - coordinates.min()) / pixel).astype(np.int64)
+            for coordinates in (across, up)
         )
         width = columns.max() + 1
         place = rows * width + columns
@@ -171,13 +172,13 @@ def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs
 
 
 def _agreement(
-    points: np.ndarray, normals: np.ndarray, one: np.ndarray, other: np.ndarray
+    points: np.ndarray, normals: np.ndarray, starts: np.ndarray, ends: np.ndarray
 ) -> Signs:
     """Compute cosines between normals and the mirror images of others in the plane between them."""
-    between = points[other] - points[one]
-    along = [np.einsum("ni,ni->n", normals[each], between) for each in (one, other)]
+    between = points[ends] - points[starts]
+    along = [np.einsum("ni,ni->n", normals[indices], between) for indices in (starts, ends)]
     squared = np.einsum("ni,ni->n", between, between)
-    return np.einsum("ni,ni->n", normals[one], normals[other]) - 2 * along[0] * along[1] / squared
+    return np.einsum("ni,ni->n", normals[starts], normals[ends]) - 2 * along[0] * along[1] / squared
 
 
 def _carried(
@@ -230,8 +231,8 @@ def _carried(
     return signs[:count], [patch for patch in patches if len(patch) >= _LEAST_PATCH]
 
 
-def _components(cost: np.ndarray, one: np.ndarray, other: np.ndarray, count: int) -> np.ndarray:
-    graph = scipy.sparse.coo_array((cost, (one, other)), shape=(count, count))
+def _components(cost: np.ndarray, starts: np.ndarray, ends: np.ndarray, count: int) -> np.ndarray:
+    graph = scipy.sparse.coo_array((cost, (starts, ends)), shape=(count, count))
     return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
 
 
@@ -264,8 +265,8 @@ def _turn_cavities(
             patch[np.linspace(0, len(patch) - 1, min(len(patch), _PROBES)).astype(np.int64)]
         ]
         everything = np.median(_winding(probes, points, oriented))
-        own = np.median(_winding(probes, points[patch], oriented[patch]))
-        if (everything - own - 0.5) * own > _CLEAR:
+        of_patch = np.median(_winding(probes, points[patch], oriented[patch]))
+        if (everything - of_patch - 0.5) * of_patch > _CLEAR:
             signs[patch] *= -1
             oriented[patch] *= -1
 
@@ -284,9 +285,9 @@ def _winding(
         np.add.reduceat(points, starts) / sizes[:, None],
         np.add.reduceat(oriented, starts),
     )
-    found = np.empty(len(probes))
+    angles = np.empty(len(probes))
     for i, probe in enumerate(probes):  # one by one, in memory that does not grow with both
         way = middles - probe[None]
         cubed = np.einsum("bi,bi->b", way, way) ** 1.5
-        found[i] = (np.einsum("bi,bi->b", way, normals) / np.where(cubed > 0, cubed, np.inf)).sum()
-    return found / (4 * np.pi)
+        angles[i] = (np.einsum("bi,bi->b", way, normals) / np.where(cubed > 0, cubed, np.inf)).sum()
+    return angles / (4 * np.pi)

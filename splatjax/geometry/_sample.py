@@ -264,7 +264,7 @@ def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.n
     alone = (distances > _ALONE * np.median(distances[near], axis=1)) & ~is_neighbor
     if alone.any():
         areas[alone], radii[alone] = (
-            np.median(each[near[alone]], axis=1) for each in (areas, radii)
+            np.median(values[near[alone]], axis=1) for values in (areas, radii)
         )
         warnings.warn(
             f"{alone.sum()} of {len(centers)} points are isolated, one of them "

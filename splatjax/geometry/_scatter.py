@@ -77,22 +77,22 @@ def surface_cells(
 
     def measure(start: int) -> tuple[np.ndarray, ...]:
         part = slice(start, min(start + _CHUNK, count))
-        others, own, mirrored = near[part, 1:], single[part], images[part]
+        indices, facing, mirrored = near[part, 1:], single[part], images[part]
         gaps = np.linalg.norm(mirrored, axis=-1)
-        ways = np.concatenate([points[others] - points[part, None], mirrored], axis=1)
+        ways = np.concatenate([points[indices] - points[part, None], mirrored], axis=1)
         lengths = np.concatenate([distances[part, 1:], np.where(gaps > 0, gaps, np.inf)], axis=1)
         squared = np.square(lengths).astype(np.float32)
         coincident = squared == 0
-        theirs = [single[others], np.broadcast_to(own[:, None], mirrored.shape)]
-        same_side = np.einsum("nki,ni->nk", np.concatenate(theirs, 1), own) > 0.1
+        theirs = [single[indices], np.broadcast_to(facing[:, None], mirrored.shape)]
+        same_side = np.einsum("nki,ni->nk", np.concatenate(theirs, 1), facing) > 0.1
         squared = np.where(same_side & ~coincident, squared, np.inf)
-        axes = np.stack(tangent_frames(own))
+        axes = np.stack(tangent_frames(facing))
         across = np.einsum("nki,ani->nka", ways.astype(np.float32), axes)
         # Of the distance to the border of the cell; negative behind the point.
         inverse = (across @ fan) * (2 / squared)[..., None]
         nearest = distances[part, 1:7]
         around = nearest.sum(axis=1) / np.maximum((nearest > 0).sum(axis=1), 1)
-        end = _OPEN_END * around if limit is None else np.full(len(own), limit)
+        end = _OPEN_END * around if limit is None else np.full(len(facing), limit)
         border = 1 / np.maximum(inverse.max(axis=1), 1 / np.maximum(end, 1e-12)[:, None])
         area = 0.5 * step * np.einsum("nd,nd->n", border, border)
         moment = (step / 3) * (border**3 @ fan.T) / np.maximum(area, 1e-30)[:, None]
@@ -278,14 +278,14 @@ class Rounding:
     def positions(self, points: SurfacePoints) -> Float[np.ndarray, "n 3"]:
         """Return points of the mesh moved from its triangles to the surface, mm."""
         mesh, faces, moved = self._mesh, points.faces, points.positions(self._mesh)
-        for one, other in ((0, 1), (1, 2), (2, 0)):
-            v, w = mesh.faces[faces, one], mesh.faces[faces, other]
+        for start, end in ((0, 1), (1, 2), (2, 0)):
+            v, w = mesh.faces[faces, start], mesh.faces[faces, end]
             edge = mesh.vertices[w] - mesh.vertices[v]
             away = [
                 np.einsum("ni,ni->n", edge, mesh.normals[at])[:, None] * mesh.normals[at]
                 for at in (v, w)
             ]
-            share = 0.5 * points.barycentrics[:, one] * points.barycentrics[:, other]
+            share = 0.5 * points.barycentrics[:, start] * points.barycentrics[:, end]
             share = np.where(self._is_smooth[v] & self._is_smooth[w], share, 0.0)
             moved += share[:, None] * (away[1] - away[0])
         return moved
