@@ -60,26 +60,29 @@ class MovableScene(eqx.Module):
     def of_picture(self, x: Coordinates, number: int) -> Coordinates:
         """Select the coordinates that a picture depends on."""
         return tuple(
-            own if part.shared else own[number] for part, own in zip(self.parts, x, strict=True)
+            coordinates if part.shared else coordinates[number]
+            for part, coordinates in zip(self.parts, x, strict=True)
         )
 
     def of_all(self, pictures: Sequence[Coordinates]) -> Coordinates:
         """Combine derivatives in the coordinates of each picture: add those of shared parts."""
         return tuple(
-            jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *own) if part.shared else own
-            for part, own in zip(self.parts, zip(*pictures, strict=True), strict=True)
+            jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *derivatives)
+            if part.shared
+            else derivatives
+            for part, derivatives in zip(self.parts, zip(*pictures, strict=True), strict=True)
         )
 
     def moved(self, pictured: PicturedScene, x: Coordinates) -> PicturedScene:
-        for part, own, prepared in zip(self.parts, x, self.prepared, strict=True):
-            pictured = part.moved(pictured, own, prepared)
+        for part, coordinates, prepared in zip(self.parts, x, self.prepared, strict=True):
+            pictured = part.moved(pictured, coordinates, prepared)
         return pictured
 
     def prior(self, x: Coordinates) -> Float[Array, ""] | float:
         return sum(
-            part.prior(one, prepared)
-            for part, own, prepared in zip(self.parts, x, self.prepared, strict=True)
-            for one in ((own,) if part.shared else own)
+            part.prior(group, prepared)
+            for part, coordinates, prepared in zip(self.parts, x, self.prepared, strict=True)
+            for group in ((coordinates,) if part.shared else coordinates)
         )
 
 
@@ -131,11 +134,13 @@ def advance(
 ):
     """Take a step; also return the loss before it, and whether loss and gradient are finite."""
     prior, prior_gradient = jax.value_and_grad(lambda x: jnp.asarray(scene.prior(x)))(x)
-    counts = [jnp.sum(one.counted) * one.beauty.shape[2] for one in evaluations]
+    counts = [
+        jnp.sum(evaluation.counted) * evaluation.beauty.shape[2] for evaluation in evaluations
+    ]
     count = jnp.maximum(sum(counts), 1.0)
-    gradients = scene.of_all([one.gradient for one in evaluations])
+    gradients = scene.of_all([evaluation.gradient for evaluation in evaluations])
     gradient = jax.tree.map(lambda *leaves: sum(leaves) / count, gradients, prior_gradient)
-    loss = (sum(one.loss for one in evaluations) + prior) / count
+    loss = (sum(evaluation.loss for evaluation in evaluations) + prior) / count
     finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, gradient))])
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         updates, state = optimizer.update(gradient, state, x)
@@ -229,10 +234,10 @@ def fit_scene(
     dtype = splats.centers.dtype
     pictured_scenes, material = jax.tree.map(
         lambda leaf: as_floats(np.asarray(leaf), dtype),
-        ([PicturedScene(splats, one.camera, one.lights) for one in observations], material),
+        ([PicturedScene(splats, view.camera, view.lights) for view in observations], material),
     )
     scene = MovableScene.of(pictured_scenes[0].splats, material, parts)
-    evidence = [Evidence.of(one, dtype) for one in observations]
+    evidence = [Evidence.of(observation, dtype) for observation in observations]
     x = scene.start(pictured_scenes)
 
     def moved(x: Coordinates) -> list[PicturedScene]:
@@ -243,8 +248,8 @@ def fit_scene(
 
     def evaluate_all(x: Coordinates, plans: list[Plan]) -> list[Evaluation]:
         return [
-            evaluate(scene.of_picture(x, i), scene, *one, settings, loss, background)
-            for i, one in enumerate(zip(pictured_scenes, evidence, plans, strict=True))
+            evaluate(scene.of_picture(x, i), scene, *inputs, settings, loss, background)
+            for i, inputs in enumerate(zip(pictured_scenes, evidence, plans, strict=True))
         ]
 
     report("planning", np.nan)
@@ -255,7 +260,7 @@ def fit_scene(
     best, at, losses, result = None, x, [], optx.RESULTS.successful
     for step in range(steps + 1):
         evaluations = evaluate_all(x, plans)
-        if max(float(one.overflow) for one in evaluations) > 0:
+        if max(float(evaluation.overflow) for evaluation in evaluations) > 0:
             report(
                 f"step {step}: the scene exceeds the capacity of its plan; planning again",
                 losses[-1] if losses else np.nan,
@@ -263,7 +268,7 @@ def fit_scene(
             plans, times = make_plans(moved(x), material, settings), times + 1
             evaluations = evaluate_all(x, plans)
         if step == 0:
-            check_counted([one.counted for one in evaluations])
+            check_counted([evaluation.counted for evaluation in evaluations])
         ahead, state, value, finite = advance(x, state, evaluations, scene, optimizer)
         losses.append(float(value))
         if not bool(finite):
@@ -279,13 +284,15 @@ def fit_scene(
             "cameras, and for splats at a light"
         )
     pictures, residuals = compared(
-        [one.beauty for one in kept], [one.counted for one in kept], evidence
+        [evaluation.beauty for evaluation in kept],
+        [evaluation.counted for evaluation in kept],
+        evidence,
     )
     pictured_scenes = moved(at)
     fitted = FittedScene(
         splats=pictured_scenes[0].splats,
-        cameras=tuple(one.camera for one in pictured_scenes),
-        lights=tuple(one.lights for one in pictured_scenes),
+        cameras=tuple(pictured.camera for pictured in pictured_scenes),
+        lights=tuple(pictured.lights for pictured in pictured_scenes),
         material=material,
         losses=np.asarray(losses),
         pictures=pictures,

@@ -245,11 +245,11 @@ class Evidence(eqx.Module):
     @classmethod
     def of(cls, observation: Observation, dtype: DTypeLike) -> "Evidence":
         picture = np.asarray(observation.picture, np.float64)
-        known = np.all(np.isfinite(picture), axis=-1)
+        mask = np.all(np.isfinite(picture), axis=-1)
         if observation.mask is not None:
-            known &= np.asarray(observation.mask)
-        picture = np.where(known[..., None], picture, 0.0)
-        brightness = (float(np.sqrt(np.mean(picture[known] ** 2))) if known.any() else 0.0) or 1.0
+            mask &= np.asarray(observation.mask)
+        picture = np.where(mask[..., None], picture, 0.0)
+        brightness = (float(np.sqrt(np.mean(picture[mask] ** 2))) if mask.any() else 0.0) or 1.0
         deviation = (
             np.full(picture.shape, _UNKNOWN_NOISE * brightness)
             if observation.deviation is None
@@ -258,7 +258,7 @@ class Evidence(eqx.Module):
         return cls(
             jnp.asarray(picture, dtype),
             jnp.asarray(deviation, dtype),
-            jnp.asarray(known),
+            jnp.asarray(mask),
             jnp.asarray(np.median(deviation) / brightness, dtype),
         )
 
@@ -282,10 +282,10 @@ class Evidence(eqx.Module):
 def check_channels(observations: Sequence[Observation], channels: int, source: str) -> None:
     """Raise `ValueError` for a picture of another number of channels than its source has."""
     for i, observation in enumerate(observations):
-        found = observation.picture.shape[2]
-        if found != channels:
+        count = observation.picture.shape[2]
+        if count != channels:
             raise ValueError(
-                f"observations[{i}].picture has {found} channels, {source} has {channels}"
+                f"observations[{i}].picture has {count} channels, {source} has {channels}"
             )
 
 
@@ -310,5 +310,6 @@ def compared(
         for picture, pixels in zip(pictures, counted, strict=True)
     )
     return made, tuple(
-        picture - np.asarray(one.picture) for picture, one in zip(made, evidence, strict=True)
+        picture - np.asarray(observed.picture)
+        for picture, observed in zip(made, evidence, strict=True)
     )

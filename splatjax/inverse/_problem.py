@@ -52,12 +52,15 @@ def make_plans(
     compiled twice.
     """
     keys = [
-        (jax.tree.structure(one.camera), jax.tree.structure(one.lights)) for one in pictured_scenes
+        (jax.tree.structure(view.camera), jax.tree.structure(view.lights))
+        for view in pictured_scenes
     ]
     plans = {}
     for key in dict.fromkeys(keys):
-        alike = [one for one, other in zip(pictured_scenes, keys, strict=True) if other == key]
-        scenes, cameras = [one.scene(material) for one in alike], [one.camera for one in alike]
+        alike = [
+            view for view, own_key in zip(pictured_scenes, keys, strict=True) if own_key == key
+        ]
+        scenes, cameras = [view.scene(material) for view in alike], [view.camera for view in alike]
         plans[key] = make_plan(scenes, cameras, settings)
     return [plans[key] for key in keys]
 
@@ -83,12 +86,12 @@ def render_layers(
         # By plan and lights of the pictures: for three or more under the same lights, the light is
         # computed once. For two, compilation costs more than this saves.
         keys = [
-            (id(plan), *(leaf.tobytes() for leaf in jax.tree.leaves(jax.device_get(one.lights))))
-            for one, plan in zip(pictured_scenes, plans, strict=True)
+            (id(plan), *(leaf.tobytes() for leaf in jax.tree.leaves(jax.device_get(view.lights))))
+            for view, plan in zip(pictured_scenes, plans, strict=True)
         ]
         lights = {
-            key: illuminate(one.scene(material), plan, settings, derivative)
-            for key, (one, plan) in dict(
+            key: illuminate(view.scene(material), plan, settings, derivative)
+            for key, (view, plan) in dict(
                 zip(keys, zip(pictured_scenes, plans, strict=True), strict=True)
             ).items()
             if keys.count(key) > 2
@@ -96,10 +99,10 @@ def render_layers(
         return [
             jax.block_until_ready(
                 diffusion_basis(
-                    one.scene(material), one.camera, settings, plan, derivative, lights.get(key)
+                    view.scene(material), view.camera, settings, plan, derivative, lights.get(key)
                 )
             )
-            for key, one, plan in zip(keys, pictured_scenes, plans, strict=True)
+            for key, view, plan in zip(keys, pictured_scenes, plans, strict=True)
         ]
 
     pictures = render(plans) if plans else []
@@ -209,8 +212,8 @@ class RecoveryProblem(eqx.Module):
     ) -> "RecoveryProblem":
         """Compare rendered pictures with the observed ones, at the pixels that the body fills."""
         dtype, background, kept, counted = unknowns.eta.dtype, UnknownBackground(), [], []
-        for picture, one in zip(pictures, evidence, strict=True):
-            counted.append(one.counted(picture.coverage.astype(dtype), background))
+        for picture, observed in zip(pictures, evidence, strict=True):
+            counted.append(observed.counted(picture.coverage.astype(dtype), background))
             is_lit = np.any(np.asarray(picture.pixel_radiance_per_exitance) > 0, axis=0)
             is_lit &= np.asarray(counted[-1]).reshape(-1)[np.asarray(picture.pixels)] > 0
             kept.append(_with_points(picture, np.flatnonzero(is_lit), dtype))
@@ -236,8 +239,8 @@ class RecoveryProblem(eqx.Module):
 
     def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "pixels channels"]:
         together = zip(self.evidence, self.radiance(point), self.counted, strict=True)
-        residuals = [one.residuals(*made, self.loss) for one, *made in together]
-        return jnp.concatenate([each.reshape(-1, each.shape[-1]) for each in residuals])
+        residuals = [observed.residuals(*made, self.loss) for observed, *made in together]
+        return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in residuals])
 
 
 def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) -> DiffusionBasis:
@@ -308,7 +311,7 @@ def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solu
 
     def residuals(point, log_width):
         moved = eqx.tree_at(
-            lambda one: [picture.light.interval for picture in one.pictures],
+            lambda tree: [picture.light.interval for picture in tree.pictures],
             problem,
             replace_fn=lambda interval: interval * jnp.exp(log_width),
         )

@@ -122,10 +122,10 @@ def recover(
     _check(observations, splats, starts, surface)
     report = progress or (lambda stage, medium: None)
     eta, channels = starts[0].eta, starts[0].channels
-    pictured_scenes = [PicturedScene(splats, one.camera, one.lights) for one in observations]
-    evidence = [Evidence.of(one, dtype) for one in observations]
-    unknowns = Unknowns.of(eta, [one.intensity for one in observations])
-    noise_is_known = all(one.deviation is not None for one in observations)
+    pictured_scenes = [PicturedScene(splats, view.camera, view.lights) for view in observations]
+    evidence = [Evidence.of(observation, dtype) for observation in observations]
+    unknowns = Unknowns.of(eta, [observation.intensity for observation in observations])
+    noise_is_known = all(observation.deviation is not None for observation in observations)
     wide = wide_variances(starts, splats)
     surface = surface or Material(_unweighed(wide, channels), eta=eta[0], specular=0)
 
@@ -187,7 +187,7 @@ def recover(
                     optx.RESULTS.nonlinear_max_steps_reached,
                 ),
                 noise_is_known=noise_is_known,
-                relative_noise=float(np.mean([one.relative_noise for one in evidence])),
+                relative_noise=float(np.mean([observed.relative_noise for observed in evidence])),
                 steps=steps,
                 rounds=rounds,
                 model=model,
@@ -259,8 +259,8 @@ class Prediction(eqx.Module):
         return max(worst, key=lambda combination: combination.deviation)
 
     def __str__(self) -> str:
-        name, known = self.candidate.name, percent(self.worst.deviation)
-        return f"{name}: the least known combination, {self.worst}, would be known to {known}"
+        name, deviation = self.candidate.name, percent(self.worst.deviation)
+        return f"{name}: the least known combination, {self.worst}, would be known to {deviation}"
 
 
 def next_pictures(
@@ -292,7 +292,7 @@ def next_pictures(
     if not candidates:
         raise ValueError("candidates is empty; give some, or default_candidates(splats, camera)")
     medium, dtype = recovery.medium, recovery.medium.eta.dtype
-    pictured_scenes = [PicturedScene(splats, one.camera, one.lights) for one in candidates]
+    pictured_scenes = [PicturedScene(splats, view.camera, view.lights) for view in candidates]
     pictures, _ = render_layers(pictured_scenes, recovery.material, settings)
     near = recovery.material.gaussians.variances.astype(dtype)
     fit = eqx.Partial(fit_near, near=near, weights=recovery.weights, rule=recovery.model.rule)

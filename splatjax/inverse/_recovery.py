@@ -297,13 +297,16 @@ def combined(recoveries: Sequence[Recovery]) -> Estimate:
                 f"the first {eta.tolist()}; combine recoveries of one material"
             )
     points = np.log(
-        [np.stack([one.medium.sigma_a, one.medium.sigma_s_prime], axis=-1) for one in recoveries]
+        [
+            np.stack([recovery.medium.sigma_a, recovery.medium.sigma_s_prime], axis=-1)
+            for recovery in recoveries
+        ]
     )
-    known = np.asarray([_stretched_information(recovery) for recovery in recoveries])
-    covariance = np.stack([inverse(information) for information in known.sum(axis=0)])
+    information = np.asarray([_stretched_information(recovery) for recovery in recoveries])
+    covariance = np.stack([inverse(total) for total in information.sum(axis=0)])
     # Channels that no recovery determines have no weights.
     is_known = np.isfinite(covariance)
-    means = np.einsum("cij,rcjk,rck->ci", np.where(is_known, covariance, 0.0), known, points)
+    means = np.einsum("cij,rcjk,rck->ci", np.where(is_known, covariance, 0.0), information, points)
     means = np.where(is_known.all(axis=2), means, points.mean(axis=0))
     sigma_a, sigma_s_prime = jnp.exp(jnp.asarray(means.T, eta.dtype))
     return Estimate(Medium(sigma_a, sigma_s_prime, eta), covariance)
@@ -314,4 +317,4 @@ def _stretched_information(recovery: Recovery) -> Float[np.ndarray, "channels 2 
     stretch = max(float(recovery.chi_squared), 1.0) if recovery.noise_is_known else 1.0
     covariance = recovery.covariance(stretch=stretch)
     is_known = np.all(np.isfinite(covariance), axis=(1, 2))[:, None, None]
-    return np.where(is_known, [inverse(one) for one in covariance], 0.0)
+    return np.where(is_known, [inverse(matrix) for matrix in covariance], 0.0)
