@@ -57,8 +57,8 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
     readers = {".json": _transforms, ".gltf": _gltf, ".glb": _gltf}
     reader = _colmap if path.is_dir() else readers.get(existing_file(path).suffix.lower())
     if reader is None:
-        known = "transforms.json, glTF, or a folder of COLMAP"
-        raise ValueError(f"{path}: is not a file of cameras; give {known}")
+        supported = "transforms.json, glTF, or a folder of COLMAP"
+        raise ValueError(f"{path}: is not a file of cameras; give {supported}")
     with one_sentence(path):
         for name, lens, pose in reader(path):
             name = f"{name} {len(cameras)}" if name in cameras else name
@@ -71,11 +71,11 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
 def load_camera(path: StrPath, name: str = "0", *, mm_per_unit: float, up: str = "y") -> Camera:
     """Read one of the cameras of a file (`load_cameras`), by its name or its number from 0."""
     cameras = load_cameras(path, mm_per_unit=mm_per_unit, up=up)
-    names = {str(number): each for number, each in enumerate(cameras)} | {n: n for n in cameras}
+    names = {str(number): key for number, key in enumerate(cameras)} | {n: n for n in cameras}
     if name not in names:
-        some = ", ".join([*cameras][:3])
+        first = ", ".join([*cameras][:3])
         raise ValueError(
-            f"{path}: has no camera {name!r}; give one of its {len(cameras)} names ({some}, ...), "
+            f"{path}: has no camera {name!r}; give one of its {len(cameras)} names ({first}, ...), "
             "or a number from 0"
         )
     return cameras[names[name]]
@@ -141,8 +141,8 @@ def _colmap(path: Path) -> _Found:
     lenses = {}
     for line in _lines(path / "cameras.txt"):
         number, model, width, height, *values = line.split()
-        known = zip(_MODELS.get(model, ()), map(float, values), strict=False)
-        lenses[number] = {"camera_model": model, "w": width, "h": height, **dict(known)}
+        parameters = zip(_MODELS.get(model, ()), map(float, values), strict=False)
+        lenses[number] = {"camera_model": model, "w": width, "h": height, **dict(parameters)}
     for line in _lines(path / "images.txt")[::2]:  # between them, the points of each
         _, *pose, camera, name = line.split(maxsplit=9)
         to_camera = quaternion_matrix([*map(float, pose[:4])])
@@ -183,12 +183,12 @@ def gltf_nodes(path: Path, kind: str) -> _Found:
         x, y, z, w = node.get("rotation", (0, 0, 0, 1))
         moved = translation_matrix(node.get("translation", (0, 0, 0)))
         turned = moved @ quaternion_matrix([w, x, y, z]) @ np.diag([*node.get("scale", [1] * 3), 1])
-        given = np.reshape(node.get("matrix", turned.T), (4, 4)).T
+        local = np.reshape(node.get("matrix", turned.T), (4, 4)).T
         if kind in part(node):
-            found = part(content)[f"{kind}s"][part(node)[kind]]
-            yield node.get("name", f"{kind} {index}"), found, above @ given
+            entry = part(content)[f"{kind}s"][part(node)[kind]]
+            yield node.get("name", f"{kind} {index}"), entry, above @ local
         for child in node.get("children", ()):
-            yield from place(child, above @ given)
+            yield from place(child, above @ local)
 
     for root in content["scenes"][content.get("scene", 0)].get("nodes", ()):
         yield from place(root, np.eye(4))

@@ -57,7 +57,7 @@ def read_planes(
             "or OpenEXR file"
         )
     planes = dict(zip(spec.channelnames, np.moveaxis(pixels, -1, 0), strict=True))
-    attributes = {each.name: each.value for each in spec.extra_attribs}
+    attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     return planes, attributes, str(spec.format) in ("half", "float", "double")
 
 

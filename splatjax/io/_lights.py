@@ -137,7 +137,10 @@ def picture_paths(path: StrPath) -> list[Path]:
     path = Path(path)
     pictures = read_toml(path, "name one that lists pictures")["pictures"]
     return [path] + [
-        path.parent / each[name] for each in pictures for name in ("file", "mask") if name in each
+        path.parent / entry[name]
+        for entry in pictures
+        for name in ("file", "mask")
+        if name in entry
     ]
 
 
@@ -148,16 +151,16 @@ def _observation(table: Table) -> Observation:
     if "noise" in table.entries:
         noise = table.numbers("noise")
         table.make(check_values, "noise", noise, "positive", lambda x: x > 0)
-        known = np.all(np.isfinite(picture), axis=-1)
-        known &= True if mask is None or mask.shape != known.shape else mask
-        size = np.sqrt(np.mean(np.square(picture[known]))) if known.any() else 0.0
+        counted = np.all(np.isfinite(picture), axis=-1)
+        counted &= True if mask is None or mask.shape != counted.shape else mask
+        size = np.sqrt(np.mean(np.square(picture[counted]))) if counted.any() else 0.0
         deviation = noise * (size or 1.0)
     height, width, channels = picture.shape
     return table.make(
         Observation,
         picture,
         look_at(table.table("camera", PLACE), width, height),
-        tuple(light_of(each, channels) for each in table.tables("lights", LIGHT_ENTRIES)),
+        tuple(light_of(light, channels) for light in table.tables("lights", LIGHT_ENTRIES)),
         mask,
         deviation,
         _INTENSITIES[table.one_of("intensity", _INTENSITIES, "known")](),
@@ -204,10 +207,10 @@ def light_of(table: Table, channels: int) -> AbstractLight:
     kind = table.one_of("kind", _LIGHTS)
     light, names = _LIGHTS[kind]
     table = Table(table.path, table.name, table.entries, ("kind", *names), table.folder)
-    given = [name for name in names if name in table.entries or name not in _OPTIONAL]
-    others = {"image", "count", "cast_shadows"}
-    values: dict[str, Any] = {name: table.numbers(name) for name in given if name not in others}
-    if "count" in given:
+    fields = [name for name in names if name in table.entries or name not in _OPTIONAL]
+    special = {"image", "count", "cast_shadows"}
+    values: dict[str, Any] = {name: table.numbers(name) for name in fields if name not in special}
+    if "count" in fields:
         values["count"] = int(table.number("count"))
     if kind == "environment":
         values["image"] = _environment_image(table)

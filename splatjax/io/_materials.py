@@ -274,7 +274,7 @@ def _profile(tables: Table) -> Dipole | LayeredMultipole | Skin | None:
         return None
     if "skin" in kinds:
         return skin_of(tables.table("skin", SKIN_ENTRIES))
-    layers = [layer_of(each) for each in tables.tables("layers", LAYER_ENTRIES)]
+    layers = [layer_of(layer) for layer in tables.tables("layers", LAYER_ENTRIES)]
     with naming(f"{path}: [[layers]]"):
         return LayeredMultipole(layers)
 

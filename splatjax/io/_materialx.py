@@ -49,8 +49,8 @@ def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.
     for name, value in inputs.items():
         _add_input(surface, name, np.asarray(value))
     shown = ElementTree.SubElement(root, "surfacematerial", name=_MATERIAL, type="material")
-    given = {"name": "surfaceshader", "type": "surfaceshader", "nodename": _SURFACE}
-    ElementTree.SubElement(shown, "input", given)
+    attributes = {"name": "surfaceshader", "type": "surfaceshader", "nodename": _SURFACE}
+    ElementTree.SubElement(shown, "input", attributes)
     ElementTree.indent(root)
     with atomic_path(Path(path)) as temporary:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)

@@ -37,20 +37,20 @@ def medium_of(table: Table) -> Medium:
     """Make the medium of a table of reduced scattering, of scattering and its mean cosine, or of a
     color and a mean free path.
     """
-    given = (table.entries.keys() & set().union(*_WAYS)) - {"g"}
-    if given not in [way - {"g"} for way in _WAYS] or ("sigma_s" in given) > ("g" in table.entries):
+    names = (table.entries.keys() & set().union(*_WAYS)) - {"g"}
+    if names not in [way - {"g"} for way in _WAYS] or ("sigma_s" in names) > ("g" in table.entries):
         raise ValueError(
-            f"{table.where} has {', '.join(sorted(given)) or 'no coefficients'}; give sigma_a and "
+            f"{table.where} has {', '.join(sorted(names)) or 'no coefficients'}; give sigma_a and "
             "sigma_s_prime, or sigma_a, sigma_s and g, or color and mean_free_path"
         )
     eta, g = table.numbers("eta"), table.number("g", 0.0)
-    if "color" in given:
+    if "color" in names:
         table.one_of("unit", [THICKNESS_UNIT])
-        both = table.numbers("color"), table.numbers("mean_free_path")
-        return table.make(HalfSpace.of_color, *both, eta, g).medium
+        color, mean_free_path = table.numbers("color"), table.numbers("mean_free_path")
+        return table.make(HalfSpace.of_color, color, mean_free_path, eta, g).medium
     per_mm, reduced = _PER_MM[table.one_of("unit", _PER_MM)], "sigma_s_prime"
     sigma_a, factor = per_mm * table.numbers("sigma_a"), per_mm
-    if "sigma_s" in given:
+    if "sigma_s" in names:
         reduced, factor = "sigma_s", per_mm * (1 - g)
     return table.make(Medium, sigma_a, factor * table.numbers(reduced), eta)
 
@@ -59,8 +59,8 @@ def plain_openpbr(table: Table) -> dict[str, Any]:
     """Translate the table of an OpenPBR material to a [medium]."""
     per_unit = _MM[table.one_of("unit", _MM)]
     color, radius, scale, eta, g = (table.numbers(*entry) for entry in _OPENPBR.items())
-    given = {"color": color, "mean_free_path": per_unit * radius * scale, "eta": eta, "g": g}
-    return {"unit": THICKNESS_UNIT, **{name: values.tolist() for name, values in given.items()}}
+    medium = {"color": color, "mean_free_path": per_unit * radius * scale, "eta": eta, "g": g}
+    return {"unit": THICKNESS_UNIT, **{name: values.tolist() for name, values in medium.items()}}
 
 
 def layer_of(table: Table) -> Layer | Film:

@@ -176,18 +176,20 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
     if kind not in FORMATS:
         raise ValueError(f"{path}: is not a known mesh format; give {', '.join(FORMATS)}")
     with one_sentence(path):
-        found = load_with_trimesh(path, kind)
+        content = load_with_trimesh(path, kind)
         pieces = {
-            name: _piece(table, kind, found["columns"])
-            for name, table in found.get("geometry", {"": found}).items()
+            name: _piece(table, kind, content["columns"])
+            for name, table in content.get("geometry", {"": content}).items()
             if np.size(table.get("faces", ()))
         }
         read = sum(len(piece.mesh.faces) for piece in pieces.values())
-        if found["triangles"] not in (None, read):
-            raise ValueError(f"{found['triangles']} triangles were expected, and {read} were read")
+        if content["triangles"] not in (None, read):
+            raise ValueError(
+                f"{content['triangles']} triangles were expected, and {read} were read"
+            )
         # Parents come before their children.
-        world, placed = {found.get("base_frame"): np.eye(4)}, []
-        for node in found.get("graph", [{"geometry": name} for name in pieces]):
+        world, placed = {content.get("base_frame"): np.eye(4)}, []
+        for node in content.get("graph", [{"geometry": name} for name in pieces]):
             matrix = world[node.get("frame_from")] @ node.get("matrix", np.eye(4))
             world[node.get("frame_to")] = matrix
             if node.get("geometry") in pieces:
@@ -196,13 +198,13 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
             raise ValueError(
                 f"{path}: has no triangle; give a triangle mesh, or read points with read_splats"
             )
-        corners = sum(3 * len(each.mesh.faces) + len(each.mesh.vertices) for each, _ in placed)
+        corners = sum(3 * len(piece.mesh.faces) + len(piece.mesh.vertices) for piece, _ in placed)
         check_memory(
             f"{path}: a scene of {corners} corners",
             _BYTES_PER_CORNER * corners,
             "export a part of it",
         )
-        repeats = not _ENDS.search(found["contents"])
+        repeats = not _ENDS.search(content["contents"])
         return [_placed(piece, matrix, up, repeats) for piece, matrix in placed]
 
 
@@ -285,7 +287,7 @@ def _joined(pieces: Sequence[Piece], mm_per_unit: float, flip_v: bool) -> Mesh:
         normals,
         None if np.isnan(uvs).all() else uvs * [1, -1 if flip_v else 1] + [0, 1.0 * flip_v],
         None if np.isnan(colors).all() else np.nan_to_num(colors, nan=1.0),
-        np.repeat(np.arange(len(pieces)), [len(each) for each in faces]),
+        np.repeat(np.arange(len(pieces)), [len(triangles) for triangles in faces]),
     )
 
 

@@ -293,8 +293,8 @@ def _values(
 ) -> Float[np.ndarray, "*shape"]:
     with np.errstate(invalid="ignore"):  # of NaN that signals
         values = scale * np.stack(list(columns.values())).astype(np.float64)
-    kind, *others = {column.dtype for column in columns.values()}
-    is_encoded = field == "albedo" and not others and kind.kind in "iu"
+    kind, *other_kinds = {column.dtype for column in columns.values()}
+    is_encoded = field == "albedo" and not other_kinds and kind.kind in "iu"
     if is_encoded:
         values = values / np.iinfo(kind).max
     holds, expected = _VALID[field]

@@ -72,7 +72,7 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
         material = material if splats.albedo is None else material.white()
     else:
         material = read_material(file.table("material", MATERIAL_TABLES))
-    lights = [light_of(each, material.channels) for each in file.tables("lights", LIGHT_ENTRIES)]
+    lights = [light_of(light, material.channels) for light in file.tables("lights", LIGHT_ENTRIES)]
     table = file.table("settings", ("bounces", "diffusion"))
     diffuser = DIFFUSERS[table.one_of("diffusion", DIFFUSERS, "clusters")]
     bounces = int(table.number("bounces", 0.0))

@@ -42,35 +42,35 @@ class Table:
     """A table of a TOML file, whose entries are checked as they are read.
 
     **Raises:** `ValueError` for anything but a table, and for an entry that is not among the
-    `known`.
+    `names`.
     """
 
     def __init__(
-        self, path: Path, name: str, entries: Any, known: Iterable[str], folder: Path | None = None
+        self, path: Path, name: str, entries: Any, names: Iterable[str], folder: Path | None = None
     ):
         self.path, self.name, self.entries = path, name, entries
         self.folder = folder or path.parent  # of the files that it names
         self.where = f"{path}: [{name}]" if name else f"{path}:"
         if not isinstance(entries, dict):
             raise ValueError(f"{self.where} must be a table; it is {entries!r}")
-        unknown = sorted(entries.keys() - known)
+        unknown = sorted(entries.keys() - names)
         if unknown:
             raise ValueError(
-                f"{self.where} has an unknown entry {unknown[0]!r}; {nearest(unknown[0], known)}"
+                f"{self.where} has an unknown entry {unknown[0]!r}; {nearest(unknown[0], names)}"
             )
 
-    def table(self, name: str, known: Iterable[str]) -> "Table":
+    def table(self, name: str, names: Iterable[str]) -> "Table":
         inner = f"{self.name} {name}".strip()
-        return Table(self.path, inner, self.entries.get(name), known, self.folder)
+        return Table(self.path, inner, self.entries.get(name), names, self.folder)
 
-    def tables(self, name: str, known: Iterable[str]) -> "list[Table]":
+    def tables(self, name: str, names: Iterable[str]) -> "list[Table]":
         """Return a list of tables within this one, from 1."""
-        given = self.entries.get(name)
-        if not isinstance(given, list) or not given:
-            raise ValueError(f"{self.where} {name} must be one table or more; it is {given!r}")
+        value = self.entries.get(name)
+        if not isinstance(value, list) or not value:
+            raise ValueError(f"{self.where} {name} must be one table or more; it is {value!r}")
         return [
-            Table(self.path, f"{self.name} {name} {number}".strip(), entries, known, self.folder)
-            for number, entries in enumerate(given, start=1)
+            Table(self.path, f"{self.name} {name} {number}".strip(), entries, names, self.folder)
+            for number, entries in enumerate(value, start=1)
         ]
 
     def one_of(self, name: str, choices: Iterable[Any], default: Any = None) -> Any:
@@ -87,14 +87,14 @@ class Table:
 
         The records made from them (`make`) check ranges and shapes.
         """
-        given = self.entries.get(name, default)
-        kinds = {type(leaf) for leaf in jax.tree.leaves(given)}
+        value = self.entries.get(name, default)
+        kinds = {type(leaf) for leaf in jax.tree.leaves(value)}
         if kinds and kinds <= {int, float}:
             with suppress(TypeError, ValueError, OverflowError):  # rows of several lengths
-                return jnp.asarray(rounded(given))
+                return jnp.asarray(rounded(value))
         raise ValueError(
             f"{self.where} {name} must be a number, a list of numbers or rows of equal length; it "
-            f"is {'missing' if given is None else repr(given)}"
+            f"is {'missing' if value is None else repr(value)}"
         )
 
     def number(self, name: str, default: float | None = None) -> float:
@@ -127,11 +127,11 @@ def write_toml(path: StrPath, tables: Mapping[str, Any]) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, choices: Iterable[str]) -> str:
     """Suggest the known name that is nearest to an unknown one, or list all of them."""
-    known = sorted(known)
-    near = difflib.get_close_matches(name.lower(), known, n=1)
-    return f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+    choices = sorted(choices)
+    near = difflib.get_close_matches(name.lower(), choices, n=1)
+    return f"did you mean {near[0]!r}?" if near else f"known are {', '.join(choices)}"
 
 
 def rounded(values: Any) -> np.ndarray:
@@ -294,15 +294,15 @@ def spectrum_to_rgb(
     """
     import colour  # takes two seconds
 
-    known = np.asarray(wavelengths, np.float64)
-    check_values("the steps of wavelengths", np.diff(known), "positive (nm)", lambda x: x > 0)
+    nodes = np.asarray(wavelengths, np.float64)
+    check_values("the steps of wavelengths", np.diff(nodes), "positive (nm)", lambda x: x > 0)
     lights, observer = colour.SDS_ILLUMINANTS, colour.MSDS_CMFS[_OBSERVER]
     if illuminant not in lights:
         raise ValueError(f"illuminant {illuminant!r} is unknown; {nearest(illuminant, lights)}")
     shape = colour.SpectralShape(380, 780, 1)
     light = lights[illuminant].copy().align(shape).values
     seen = observer.copy().align(shape).values
-    hats = [np.interp(shape.wavelengths, known, hat) for hat in np.eye(len(known))]
+    hats = [np.interp(shape.wavelengths, nodes, hat) for hat in np.eye(len(nodes))]
     xyz = np.asarray(hats) @ (light[:, None] * seen)
     rgb = xyz @ colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB.T
     return rgb / rgb.sum(axis=0)

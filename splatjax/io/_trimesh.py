@@ -59,9 +59,11 @@ def _count_off(text: bytes) -> int:
 
 def _check_gltf(text: bytes) -> None:
     content = json.loads(text)
-    primitives = [each for mesh in content.get("meshes", []) for each in mesh["primitives"]]
+    primitives = [
+        primitive for mesh in content.get("meshes", []) for primitive in mesh["primitives"]
+    ]
     for name in ("POSITION", "TEXCOORD_0"):
-        used = {each["attributes"].get(name) for each in primitives} - {None}
+        used = {primitive["attributes"].get(name) for primitive in primitives} - {None}
         if any(content["accessors"][i]["componentType"] != _FLOAT for i in used):
             raise ValueError("its vertices are quantized")
 
@@ -129,14 +131,14 @@ def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
 
     folder, data = _Folder(path), path.read_bytes()
     loaders, count = cast(dict[str, Any], load.mesh_loaders), _count_triangles(kind, data)
-    found = loaders[kind](BytesIO(data), resolver=folder, fix_texture=False)
+    content = loaders[kind](BytesIO(data), resolver=folder, fix_texture=False)
     columns = {
         name: _columns(name, element)
-        for name, element in found.get("metadata", {}).get("_ply_raw", {}).items()
+        for name, element in content.get("metadata", {}).get("_ply_raw", {}).items()
     }
     for fault in folder.faults:
         warnings.warn(f"{path}: {fault}, and its colors are ignored", stacklevel=2)
-    return found | {"triangles": count, "contents": data, "columns": columns}
+    return content | {"triangles": count, "contents": data, "columns": columns}
 
 
 def _columns(name: str, element: dict[str, Any]) -> dict[str, np.ndarray]:
