@@ -176,7 +176,7 @@ class Fit:
         print(self.output)
 
     def _run(self) -> None:
-        known, target = self._target()
+        coefficients, target = self._target()
         fitted = self._fitted(target)
         print_fit(fitted, target)
         self._note_spread(target, fitted)
@@ -187,7 +187,7 @@ class Fit:
                 "it receives; check its unit and power"
             )
         if self.output is not None:
-            self._save(self.output, known, target, fitted)
+            self._save(self.output, coefficients, target, fitted)
             print(self.output)
         if self.plot is not None:
             from splatjax.plots import plot_fit  # loads matplotlib
@@ -212,20 +212,24 @@ class Fit:
         what is fitted; raise for options without effect on the kind of input.
         """
         kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
-        given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
-        for other, names in _OPTIONS.items():
-            without_effect = [name for name in names if other != kind and name in given]
+        changed = {
+            field.name for field in fields(self) if getattr(self, field.name) != field.default
+        }
+        for intended, names in _OPTIONS.items():
+            without_effect = [name for name in names if intended != kind and name in changed]
             if without_effect:
                 raise ValueError(
-                    f"{option_name(without_effect[0])} is for {other}, and {self.medium} is "
+                    f"{option_name(without_effect[0])} is for {intended}, and {self.medium} is "
                     f"read as {kind}; leave it out"
                 )
         if kind == _COEFFICIENTS:
-            known = sj.load_profile(self.medium)
+            coefficients = sj.load_profile(self.medium)
             # A dipole depends only on the reduced coefficients.
-            knows = self.g is not None or self.model not in ("dipole", "better-dipole")
-            g = self._mean_cosine() if knows else 0.0
-            return known, reference(known, self.model, self.photons, g, self.single_scattering)
+            needs_g = self.g is not None or self.model not in ("dipole", "better-dipole")
+            g = self._mean_cosine() if needs_g else 0.0
+            return coefficients, reference(
+                coefficients, self.model, self.photons, g, self.single_scattering
+            )
         if kind == _PROFILE:
             measured = sj.io.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
         elif self.mm_per_pixel is None:
@@ -268,20 +272,22 @@ class Fit:
     def _save(
         self,
         output: Path,
-        known: Coefficients | None,
+        coefficients: Coefficients | None,
         target: Reference,
         fitted: sj.fitting.FitResult,
     ) -> None:
         surface, source = dict[str, Any](), dict[str, Any]()
-        if known is not None:
+        if coefficients is not None:
             # The index of a surface is that of the medium it bounds, unless the file gives it.
-            top = known.top if isinstance(known, sj.LayeredMultipole) else known
+            top = (
+                coefficients.top if isinstance(coefficients, sj.LayeredMultipole) else coefficients
+            )
             eta = top.eta if isinstance(top, sj.scattering.Skin) else top.medium.eta[0]
             surface, source = sj.io.surface_and_source(self.medium)
             surface.setdefault("eta", eta)
         fitted_by = (
             f"fitted by splatjax {sj.__version__} to the "
-            f"{'profile' if known is None else 'coefficients'} of {self.medium}"
+            f"{'profile' if coefficients is None else 'coefficients'} of {self.medium}"
         )
         before = source.get("provenance", "").split("; fitted by splatjax")[0]
         provenance = "; ".join(filter(None, [before, fitted_by]))
@@ -290,20 +296,20 @@ class Fit:
                 fitted.gaussians, **surface, single_scattering=target.single, angles=target.angles
             ),
             output,
-            profile=target.profile if target.description is None else known,
+            profile=target.profile if target.description is None else coefficients,
             source=source | {"provenance": provenance},
             fit={
                 **({} if target.description is None else {"profile": target.description}),
                 "variances_of": "all channels",
                 "weights_of": (
                     "non-negative"
-                    if known is None
+                    if coefficients is None
                     else "non-negative, sum held to the total reflectance"
                 ),
                 "error": fitted.error,
                 "energy_error": fitted.energy_error,
             },
-            g=self._mean_cosine() if isinstance(known, sj.Dipole) else 0.0,
+            g=self._mean_cosine() if isinstance(coefficients, sj.Dipole) else 0.0,
         )
 
     def _mean_cosine(self) -> float:

@@ -90,13 +90,13 @@ def parsed(words: list[str]) -> Any:
 
     Only the command of the first word is parsed, so that help and errors are about it alone.
     """
-    name, *rest = words or ["--help"]
+    name, *arguments = words or ["--help"]
     style = (tyro.conf.PositionalMetavarFromFieldName,)
     if name == "--version":
         print(f"splatjax {sj.__version__}, jax {jax.__version__}")
         raise SystemExit
     if name in _COMMANDS:
-        return tyro.cli(_COMMANDS[name], prog=f"splatjax {name}", args=rest, config=style)
+        return tyro.cli(_COMMANDS[name], prog=f"splatjax {name}", args=arguments, config=style)
     commands: list[Any] = [
         Annotated[kind, tyro.conf.subcommand(key, description=str(kind.__doc__).partition("\n")[0])]
         for key, kind in _COMMANDS.items()
@@ -105,7 +105,7 @@ def parsed(words: list[str]) -> Any:
         functools.reduce(operator.or_, commands),
         prog="splatjax",
         description=_DESCRIPTION,
-        args=[name, *rest],
+        args=[name, *arguments],
         config=style,
     )
 

@@ -109,19 +109,19 @@ def _row(name: str) -> tuple[str, ...]:
     material, (_, source) = sj.load_material(name), sj.io.surface_and_source(name)
     try:
         kinds = {sj.LayeredMultipole: "layers", sj.scattering.Skin: "pigments"}
-        known = kinds.get(type(sj.load_profile(name)), "coefficients")
+        kind = kinds.get(type(sj.load_profile(name)), "coefficients")
     except ValueError:
-        known = "Gaussians"
+        kind = "Gaussians"
     citation = source["citation"]
     authors, year = (re.findall(r"^(.+?) (\d{4})", citation) or [(citation, "")])[0]
-    first, *others = re.split(r", | and ", authors)
+    first, *coauthors = re.split(r", | and ", authors)
     return (
         name,
-        known,
+        kind,
         "  ".join(f"{float(total):.3f}" for total in material.total_reflectance()),
         f"{float(material.gaussians.variances.max()) ** 0.5:.3g}",
         f"{float(material.eta):.3g}",
-        f"{first}{' et al.' if others else ''} {year}".rstrip(),
+        f"{first}{' et al.' if coauthors else ''} {year}".rstrip(),
     )
 
 
@@ -192,12 +192,13 @@ class Sample:
         check_output(self.output, (".ply",))
         if (self.share is None) != (self.second is None):
             raise ValueError("give --share, a map, and --second, a material, or neither")
-        own = {"mesh", "count", "output", "material", "second"}
-        options = {key: vars(self)[key] for key in vars(self).keys() - own}
+        excluded = {"mesh", "count", "output", "material", "second"}
+        options = {key: vars(self)[key] for key in vars(self).keys() - excluded}
         if self.second is not None:
             with jax.enable_x64(True):
-                both = [sj.load_material(name).gaussians for name in (self.material, self.second)]
-                options["factors"] = sj.fitting.weight_factors(*both)
+                options["factors"] = sj.fitting.weight_factors(
+                    *(sj.load_material(name).gaussians for name in (self.material, self.second))
+                )
         with stage(f"sampling {self.mesh} with {self.count} splats"):
             splats = sj.sample_mesh(self.mesh, self.count, **options)
         with stage(f"writing {self.output}"):

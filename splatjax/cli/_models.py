@@ -184,8 +184,8 @@ def fit_batch(
     """Return the columns of a batch. A smaller batch is padded, so that one program serves all. The
     starts of fits to dipoles are near the optima of other models of the same media.
     """
-    given = len(coefficients)
-    padded = np.pad(coefficients, ((0, BATCH - given), (0, 0)), mode="edge")
+    length = len(coefficients)
+    padded = np.pad(coefficients, ((0, BATCH - length), (0, 0)), mode="edge")
     fitted, angles, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count, model)
     powers = [] if angles is None else angles.coefficients[..., 0].T
     columns = {
@@ -197,7 +197,7 @@ def fit_batch(
         "energy_error": fitted.energy_error[:, 0],
         "converged": converged.astype(float),
     }
-    return {name: np.asarray(column)[:given] for name, column in columns.items()}
+    return {name: np.asarray(column)[:length] for name, column in columns.items()}
 
 
 _DISTANCES = 7
@@ -222,10 +222,12 @@ def _errors_by_distance(
     """Return rows of relative errors, from where a fit counts to where all channels have a
     hundredth of the peak of their light by logarithmic radius.
     """
-    nodes, weights = (np.asarray(each) for each in rule.radii(profile))
-    known = profile.known_radii()
+    nodes, weights = (np.asarray(values) for values in rule.radii(profile))
+    measured = profile.known_radii()
     least = max(nodes[weights > 0].min(), 0.1 * float(profile.length_scale().min()))
-    dense = jnp.geomspace(least, nodes.max(), 400) if known is None else known[0][known[0] > 0]
+    dense = (
+        jnp.geomspace(least, nodes.max(), 400) if measured is None else measured[0][measured[0] > 0]
+    )
     light = np.asarray(dense)[:, None] ** 2 * np.asarray(profile(dense))
     counts = light > 0.01 * light.max(axis=0)
     within = np.flatnonzero(counts.any(axis=1))

@@ -141,8 +141,8 @@ class Recover:
         starts = self._starts(search, dependencies, observations[0].picture.shape[2])
         begin = time.perf_counter()
 
-        def report(what: str, medium: sj.Medium) -> None:
-            note(f"{time.perf_counter() - begin:6.1f} s  {what}")
+        def report(message: str, medium: sj.Medium) -> None:
+            note(f"{time.perf_counter() - begin:6.1f} s  {message}")
             if medium is not starts[0]:
                 values = {name: getattr(medium, name).tolist() for name in _COEFFICIENTS}
                 sj.io.write_record(search, {"made of": dependencies, **values})

@@ -150,7 +150,7 @@ class Render(ViewOptions):
         lights = self.lights(material, self.azimuth, self.single_light[0])
         with stage("rendering the stream", file.count) as report:
             frame = sj.render_streamed(
-                parts, lights, material, camera, report=lambda what, done: report(done, what)
+                parts, lights, material, camera, report=lambda task, done: report(done, task)
             )
         return frame, material, lights, camera
 

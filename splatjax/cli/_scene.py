@@ -14,10 +14,10 @@ SCENE_FILES = (".toml", ".exr")
 _BESIDE = {"splats", "output", "background", "exposure", "half", "quiet"}
 
 
-def camera_of(given: str, mm_per_unit: float, up: str, height: int, scale: float) -> sj.Camera:
+def camera_of(source: str, mm_per_unit: float, up: str, height: int, scale: float) -> sj.Camera:
     """Read FILE or FILE:NAME; the picture has a height, and lengths are scaled with the body."""
-    path, _, name = ("", "", "0") if Path(given).exists() else given.rpartition(":")
-    camera = sj.io.load_camera(path or given, name or "0", mm_per_unit=mm_per_unit, up=up)
+    path, _, name = ("", "", "0") if Path(source).exists() else source.rpartition(":")
+    camera = sj.io.load_camera(path or source, name or "0", mm_per_unit=mm_per_unit, up=up)
     return replace(sj.io.resized(camera, height), position=camera.position * scale)
 
 

@@ -94,8 +94,8 @@ class Studio(ViewOptions):
 
     def _made(self, light: sj.scene.AbstractLight) -> str:
         if isinstance(light, sj.DirectionalLight):
-            given = f"{light.direction.tolist()}, {light.irradiance.tolist()}"
-            return f"sj.DirectionalLight({given}, cast_shadows={light.cast_shadows})"
+            arguments = f"{light.direction.tolist()}, {light.irradiance.tolist()}"
+            return f"sj.DirectionalLight({arguments}, cast_shadows={light.cast_shadows})"
         assert isinstance(light, sj.EnvironmentLight)
         name = self.environment_name or ""
         image = f"sj.io.load_environment({str(Path(name).absolute())!r}).image"

@@ -40,8 +40,8 @@ def check_options(command: Any, rules: Rules) -> None:
     for field, (is_valid, expected) in rules.items():
         if not is_valid:
             value = getattr(command, field)
-            given = f"{value:g}" if isinstance(value, float) else value
-            raise ValueError(f"{option_name(field)} is {given}; it must {expected}")
+            formatted = f"{value:g}" if isinstance(value, float) else value
+            raise ValueError(f"{option_name(field)} is {formatted}; it must {expected}")
 
 
 def check_output(path: Path | None, suffixes: tuple[str, ...]) -> None:
@@ -70,33 +70,33 @@ def save_figure(figure: Any, path: Path) -> None:
     print(path)
 
 
-def note(what: str) -> None:
+def note(message: str) -> None:
     """Print a message to the user."""
-    CONSOLE.print(what, markup=False)
+    CONSOLE.print(message, markup=False)
 
 
 @contextlib.contextmanager
-def stage(what: str, total: int = 0) -> Generator[Callable[..., None]]:
+def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
     """Report a stage of the work, and afterwards its time.
 
     Yields the function to call with the finished steps of a total, and with the name of the stage
     if it changes. If stderr is not a terminal, it prints a line at most once a second.
     """
     begin = last = time.perf_counter()
-    with CONSOLE.status(what) as status:
+    with CONSOLE.status(title) as status:
 
-        def report(done: int, what: str = what) -> None:
+        def report(done: int, title: str = title) -> None:
             nonlocal last
             now = time.perf_counter()
             left = (now - begin) / done * (total - done)
-            line = f"{what}: {done} of {total}, {left:.0f} s left"
+            line = f"{title}: {done} of {total}, {left:.0f} s left"
             status.update(line)
             if not CONSOLE.is_terminal and (done == total or now > last + 1):
                 last = now
                 note(line)
 
         yield report
-    note(f"{what}: {time.perf_counter() - begin:.1f} s")
+    note(f"{title}: {time.perf_counter() - begin:.1f} s")
 
 
 @contextlib.contextmanager
@@ -179,14 +179,14 @@ def complete(
     if len(missing) < len(items):
         note(f"{len(items) - len(missing)} of {len(items)} {name} exist already, and are kept")
     index, processes = process_index_and_count()
-    own = missing[index::processes]
-    if own:
+    share = missing[index::processes]
+    if share:
         make = prepare()
         folder.mkdir(exist_ok=True)
         write_record(record_path, record)
         try:
-            with stage(what, len(own)) as report:
-                for number, i in enumerate(own, 1):
+            with stage(what, len(share)) as report:
+                for number, i in enumerate(share, 1):
                     make(i)
                     report(number)
         except (KeyboardInterrupt, OSError):
@@ -198,7 +198,7 @@ def complete(
             f"other processes still compute {len(left)} {name}; the last of them joins all, or "
             "run the same command again"
         )
-    return own if left else range(len(items))
+    return share if left else range(len(items))
 
 
 def _missing(items: Sequence[tuple[Path, ...]]) -> list[int]:

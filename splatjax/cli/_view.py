@@ -136,18 +136,18 @@ class ViewOptions:
     @property
     def single_light(self) -> tuple[float, float, float]:
         """Return azimuth and elevation of the single light, and the strength of its fill."""
-        given = self.light_azimuth, self.light_elevation, self.fill
+        chosen = self.light_azimuth, self.light_elevation, self.fill
         azimuth, elevation, fill = (
             usual if value is None else value
-            for value, usual in zip(given, _SINGLE_LIGHT, strict=True)
+            for value, usual in zip(chosen, _SINGLE_LIGHT, strict=True)
         )
         return azimuth, elevation, fill
 
     @property
     def environment_name(self) -> str | None:
         """Return the environment, by default the studio; `None` for single lights."""
-        given = self.light_azimuth, self.light_elevation, self.fill
-        is_lit = any(value is not None for value in given)
+        chosen = self.light_azimuth, self.light_elevation, self.fill
+        is_lit = any(value is not None for value in chosen)
         return self.environment or (None if is_lit else "studio")
 
     @functools.cached_property
@@ -166,8 +166,8 @@ class ViewOptions:
         with stage(
             f"reading {self.splats}" if self.splats else f"making the bust of {self.count} splats"
         ):
-            whole = sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
-            splats = self.adjusted(whole)
+            splats = sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
+            splats = self.adjusted(splats)
         return splats, self.material_for(splats)
 
     def material_for(self, splats: sj.Splats) -> sj.Material:

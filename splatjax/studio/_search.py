@@ -68,8 +68,9 @@ class Search:
                 raise _Stopped
             self._report(stage, medium)
 
-        own = self._session.own.splats
-        splats = Splats(own.centers, own.normals, own.radii, own.areas)  # coefficients give color
+        body = self._session.own.splats
+        # Without albedo: coefficients give color.
+        splats = Splats(body.centers, body.normals, body.radii, body.areas)
         try:
             with jax.enable_x64(True):
                 surface = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), material)

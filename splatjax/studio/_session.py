@@ -168,17 +168,19 @@ class Session:
         return [np.asarray(row, np.float64) for row in (radii, *rows)]
 
     def _medium(self, controls: Controls) -> Medium | None:
-        own = self.own.material.medium
-        if own is None or controls.coefficients == self.start.coefficients:
-            return own
-        rows = controls.sigma_a, controls.sigma_s_prime, [controls.eta] * own.channels
+        medium = self.own.material.medium
+        if medium is None or controls.coefficients == self.start.coefficients:
+            return medium
+        rows = controls.sigma_a, controls.sigma_s_prime, [controls.eta] * medium.channels
         return Medium(*(jnp.asarray(row, self._variances.dtype) for row in rows))
 
     def _fitted(self, controls: Controls) -> SumOfGaussians:
         """Return the material's own Gaussians, or those that stand for changed coefficients."""
-        own, medium = self.own.material, self._medium(controls)
-        if medium is None or (medium is own.medium and self._variances is own.gaussians.variances):
-            return own.gaussians
+        material, medium = self.own.material, self._medium(controls)
+        if medium is None or (
+            medium is material.medium and self._variances is material.gaussians.variances
+        ):
+            return material.gaussians
         return _fit_weights(self.model, medium, self._variances)
 
     def _gaussians(self, controls: Controls) -> SumOfGaussians:
@@ -194,9 +196,10 @@ class Session:
         """Let variances and angles follow the coefficients."""
         if controls.coefficients == self._settled:
             return
-        own, medium = self.own.material, self._medium(controls)
-        held, self._angles, self._variances = self._variances, own.angles, own.gaussians.variances
-        if medium is not None and medium is not own.medium:
+        material, medium = self.own.material, self._medium(controls)
+        held, self._angles = self._variances, material.angles
+        self._variances = material.gaussians.variances
+        if medium is not None and medium is not material.medium:
             self._variances, angles = _fit(self.model, medium, held)
             self._angles = angles if self._has_color else None
         self._settled, self._fits = controls.coefficients, self._fits + 1
@@ -284,13 +287,13 @@ def _fit(
 ) -> tuple[Float[Array, " gaussians"], AngularLaw | None]:
     """Find variances near given ones, which stay where none better is found; and the angles."""
     profile, start = model.profile(medium), _fitting.GivenVariances(variances)
-    found = _fitting.fit_gaussians(
+    fitted = _fitting.fit_gaussians(
         profile, len(variances), weights=_WEIGHTS, start=start, rule=model.rule, throw=False
     )
     held = _fitting.fit_weights(profile, variances, weights=_WEIGHTS, rule=model.rule)
     error = _fitting.relative_error(profile, held, model.rule)
-    is_better = jnp.max(found.error) < jnp.max(error)
-    return jnp.where(is_better, found.gaussians.variances, variances), model.angles(medium)
+    is_better = jnp.max(fitted.error) < jnp.max(error)
+    return jnp.where(is_better, fitted.gaussians.variances, variances), model.angles(medium)
 
 
 @eqx.filter_jit
