@@ -61,7 +61,7 @@ def plot_fit(
     radii = np.asarray(r)
     ring = radii[:, None] ** 2 * reference
     # Where hardly any light is, the line ends.
-    left = np.where(
+    relative = np.where(
         ring > _LEAST * ring.max(axis=0), fitted / np.maximum(reference, 1e-300) - 1, np.nan
     )
 
@@ -86,7 +86,7 @@ def plot_fit(
         linear.plot(between, between * of_fit[:, channel], color=color, linewidth=1.2, label=label)
         log.loglog(radii, values, color=color, alpha=0.35, linewidth=width, marker=marker)
         log.loglog(between, of_fit[:, channel], color=color, linewidth=1.2)
-        residual.semilogx(radii, left[:, channel], color=color, linewidth=1.2, marker=marker)
+        residual.semilogx(radii, relative[:, channel], color=color, linewidth=1.2, marker=marker)
 
     # The radius within which the widest channel keeps four fifths of the energy that is drawn.
     ring = np.cumsum(np.gradient(radii)[:, None] * radii[:, None] * reference, axis=0)
@@ -114,7 +114,7 @@ def plot_fit(
             transform=residual.get_xaxis_transform(),
             fontsize="small",
         )
-        most = 1.3 * max(float(np.nanmax(np.abs(left[radii >= begin]))), 1e-3)
+        most = 1.3 * max(float(np.nanmax(np.abs(relative[radii >= begin]))), 1e-3)
         residual.set_ylim(-most, most)
     for axis in (log.xaxis, residual.xaxis):
         axis.set_minor_formatter(NullFormatter())  # within a decade their labels would overlap
@@ -220,23 +220,23 @@ def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
     rows = len(recovery.pictures)
     figure = Figure(figsize=(9.5, 3.1 * rows), layout="constrained")
     axes = figure.subplots(rows, 3, squeeze=False)
-    for number, (line, made, left) in enumerate(
+    for number, (row, recovered, residual) in enumerate(
         zip(axes, recovery.pictures, recovery.residuals, strict=True), 1
     ):
-        seen = made - left
+        seen = recovered - residual
         bright = float(np.nanquantile(seen, 0.99)) or 1.0
         for ax, picture, name in zip(
-            line, (seen, made), (f"picture {number}", "recovered"), strict=False
+            row, (seen, recovered), (f"picture {number}", "recovered"), strict=False
         ):
             ax.imshow(_shown(picture, bright))
             ax.set_title(name)
-        share = 100 * np.mean(left, axis=-1) / np.sqrt(np.nanmean(seen**2))
+        share = 100 * np.mean(residual, axis=-1) / np.sqrt(np.nanmean(seen**2))
         reach = float(np.nanquantile(np.abs(share), 0.99)) or 1.0
-        image = line[2].imshow(share, cmap="RdBu_r", vmin=-reach, vmax=reach)
-        line[2].set_facecolor("0.8")
-        line[2].set_title("recovered less input")
-        figure.colorbar(image, ax=line[2], label="% of the picture", shrink=0.8)
-        for ax in line:
+        image = row[2].imshow(share, cmap="RdBu_r", vmin=-reach, vmax=reach)
+        row[2].set_facecolor("0.8")
+        row[2].set_title("recovered less input")
+        figure.colorbar(image, ax=row[2], label="% of the picture", shrink=0.8)
+        for ax in row:
             ax.set(xticks=[], yticks=[])
     figure.suptitle(title or "")
     return figure

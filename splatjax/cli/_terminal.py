@@ -88,8 +88,8 @@ def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
         def report(done: int, title: str = title) -> None:
             nonlocal last
             now = time.perf_counter()
-            left = (now - begin) / done * (total - done)
-            line = f"{title}: {done} of {total}, {left:.0f} s left"
+            remaining = (now - begin) / done * (total - done)
+            line = f"{title}: {done} of {total}, {remaining:.0f} s left"
             status.update(line)
             if not CONSOLE.is_terminal and (done == total or now > last + 1):
                 last = now
@@ -192,13 +192,13 @@ def complete(
         except (KeyboardInterrupt, OSError):
             note(f"the {name} in {folder} are complete; run the same command again to continue")
             raise
-    left = _missing(items)
-    if left and folder.exists():
+    pending = _missing(items)
+    if pending and folder.exists():
         note(
-            f"other processes still compute {len(left)} {name}; the last of them joins all, or "
+            f"other processes still compute {len(pending)} {name}; the last of them joins all, or "
             "run the same command again"
         )
-    return share if left else range(len(items))
+    return share if pending else range(len(items))
 
 
 def _missing(items: Sequence[tuple[Path, ...]]) -> list[int]:

@@ -224,8 +224,8 @@ def fit_gaussians(
             profile, count.max_count, spread=spread, weights=weights, rule=rule
         )
         # Finishing a fit of shared variances may move error from one channel to another.
-        for enough in range(by_count.least(count.error), count.max_count + 1):
-            fitted = _fit_compiled(profile, enough, spread, weights, rule, by_count.start(enough))
+        for trial in range(by_count.least(count.error), count.max_count + 1):
+            fitted = _fit_compiled(profile, trial, spread, weights, rule, by_count.start(trial))
             if float(jnp.max(fitted.error)) <= count.error:
                 break
     else:

@@ -200,10 +200,10 @@ def _fit_compiled(measured, start, beam_variance, model, count) -> MediumFit:
         )
         point = jnp.log(jnp.stack([sigma_a, sigma_s_prime]))
         end = optx.least_squares(residuals, solver, point, max_steps=_STEPS, throw=False)
-        slopes, left = jax.jacfwd(lambda point: (residuals(point, None),) * 2, has_aux=True)(
+        slopes, residual = jax.jacfwd(lambda point: (residuals(point, None),) * 2, has_aux=True)(
             end.value
         )
-        chi_squared = left @ left / max(len(values) - len(point), 1)
+        chi_squared = residual @ residual / max(len(values) - len(point), 1)
         return (
             jnp.exp(end.value),
             invert(slopes.T @ slopes),

@@ -51,8 +51,8 @@ def invert_moving(
     hessian: Float[Array, "gaussians gaussians"],
 ) -> Float[Array, "gaussians gaussians"]:
     """Invert a Hessian; a Gaussian of weight zero in all channels does not move."""
-    still = jnp.diagonal(hessian) == 0
-    return invert(hessian + jnp.diag(still.astype(hessian.dtype)))
+    is_fixed = jnp.diagonal(hessian) == 0
+    return invert(hessian + jnp.diag(is_fixed.astype(hessian.dtype)))
 
 
 def least_squares(
@@ -195,8 +195,8 @@ class NonNegativeWeights(AbstractWeights):
             return jnp.where(positive, coefficients < 0, slope < -tolerance)
 
         def exchange(state):
-            positive, wrongs, steps = state
-            last = jnp.max(jnp.where(wrongs, jnp.arange(count), -1))
+            positive, is_wrong, steps = state
+            last = jnp.max(jnp.where(is_wrong, jnp.arange(count), -1))
             positive = positive ^ (jnp.arange(count) == last)
             return positive, wrong(positive), steps + 1
 

@@ -49,16 +49,16 @@ def estimate_normals(
     normals = np.empty(places.shape)
     for start in range(0, len(places), _CHUNK):
         part = slice(start, start + _CHUNK)
-        ways, indices = planes[near[part]], near[part]
-        beyond = np.einsum("nki,nki->nk", ways, places[part, None] - middles[indices]) ** 2
+        candidates, indices = planes[near[part]], near[part]
+        beyond = np.einsum("nki,nki->nk", candidates, places[part, None] - middles[indices]) ** 2
         share = (
             1
             / ((off[indices] + beyond) / np.maximum(size[part, None], np.finfo(float).tiny) + _FLAT)
             ** 2
         )
-        best = np.take_along_axis(ways, share.argmax(axis=1)[:, None, None], axis=1)
-        share *= np.where(np.einsum("nki,nji->nk", ways, best) < 0, -1.0, 1.0)
-        normals[part] = np.einsum("nk,nki->ni", share, ways)
+        best = np.take_along_axis(candidates, share.argmax(axis=1)[:, None, None], axis=1)
+        share *= np.where(np.einsum("nki,nji->nk", candidates, best) < 0, -1.0, 1.0)
+        normals[part] = np.einsum("nk,nki->ni", share, candidates)
     normals *= np.where(np.einsum("ni,ni->n", normals, outward) < 0, -1.0, 1.0)[:, None]
     return (normals / np.linalg.norm(normals, axis=1, keepdims=True))[np.argsort(along)][inverse]
 
@@ -82,8 +82,8 @@ def _planes(
         total = shares.sum(axis=1)
         middles[part] = (shares * around).sum(axis=1) / total
         around = around - middles[part, None]
-        variances, ways = np.linalg.eigh((shares * around).swapaxes(1, 2) @ around)
-        normals[part], off[part] = ways[..., 0], np.maximum(variances[:, 0], 0) / total[:, 0]
+        variances, axes = np.linalg.eigh((shares * around).swapaxes(1, 2) @ around)
+        normals[part], off[part] = axes[..., 0], np.maximum(variances[:, 0], 0) / total[:, 0]
     return middles, normals, off
 
 
@@ -264,9 +264,9 @@ def _turn_cavities(
         probes = points[
             patch[np.linspace(0, len(patch) - 1, min(len(patch), _PROBES)).astype(np.int64)]
         ]
-        everything = np.median(_winding(probes, points, oriented))
+        of_all = np.median(_winding(probes, points, oriented))
         of_patch = np.median(_winding(probes, points[patch], oriented[patch]))
-        if (everything - of_patch - 0.5) * of_patch > _CLEAR:
+        if (of_all - of_patch - 0.5) * of_patch > _CLEAR:
             signs[patch] *= -1
             oriented[patch] *= -1
 
@@ -287,7 +287,7 @@ def _winding(
     )
     angles = np.empty(len(probes))
     for i, probe in enumerate(probes):  # one by one, in memory that does not grow with both
-        way = middles - probe[None]
-        cubed = np.einsum("bi,bi->b", way, way) ** 1.5
-        angles[i] = (np.einsum("bi,bi->b", way, normals) / np.where(cubed > 0, cubed, np.inf)).sum()
+        ray = middles - probe[None]
+        cubed = np.einsum("bi,bi->b", ray, ray) ** 1.5
+        angles[i] = (np.einsum("bi,bi->b", ray, normals) / np.where(cubed > 0, cubed, np.inf)).sum()
     return angles / (4 * np.pi)

@@ -79,15 +79,15 @@ def surface_cells(
         part = slice(start, min(start + _CHUNK, count))
         indices, facing, mirrored = near[part, 1:], single[part], images[part]
         gaps = np.linalg.norm(mirrored, axis=-1)
-        ways = np.concatenate([points[indices] - points[part, None], mirrored], axis=1)
+        offsets = np.concatenate([points[indices] - points[part, None], mirrored], axis=1)
         lengths = np.concatenate([distances[part, 1:], np.where(gaps > 0, gaps, np.inf)], axis=1)
         squared = np.square(lengths).astype(np.float32)
         coincident = squared == 0
-        theirs = [single[indices], np.broadcast_to(facing[:, None], mirrored.shape)]
-        same_side = np.einsum("nki,ni->nk", np.concatenate(theirs, 1), facing) > 0.1
+        site_normals = [single[indices], np.broadcast_to(facing[:, None], mirrored.shape)]
+        same_side = np.einsum("nki,ni->nk", np.concatenate(site_normals, 1), facing) > 0.1
         squared = np.where(same_side & ~coincident, squared, np.inf)
         axes = np.stack(tangent_frames(facing))
-        across = np.einsum("nki,ani->nka", ways.astype(np.float32), axes)
+        across = np.einsum("nki,ani->nka", offsets.astype(np.float32), axes)
         # Of the distance to the border of the cell; negative behind the point.
         inverse = (across @ fan) * (2 / squared)[..., None]
         nearest = distances[part, 1:7]
@@ -212,17 +212,17 @@ def mirror_images(
     edge = np.append(edge, 0)[mark[near]]
     start, along = starts[edge], (ends - starts)[edge]
     share = np.einsum("nki,nki->nk", points[near, None] - start, along) / squared[edge]
-    ways = start + np.clip(share, 0, 1)[..., None] * along - points[near, None]
+    offsets = start + np.clip(share, 0, 1)[..., None] * along - points[near, None]
     images = np.zeros((len(points), _IMAGES, 3), np.float32)
-    images[near] = np.where(np.isfinite(distances[near])[..., None], 2 * ways, 0.0)
+    images[near] = np.where(np.isfinite(distances[near])[..., None], 2 * offsets, 0.0)
     return images
 
 
 def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Compute barycentric coordinates of the points' projections to the planes of their faces."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
-    ways = np.stack([b - a, c - a, points - a])
-    (d00, d01, d20), (_, d11, d21), _ = np.einsum("ani,bni->abn", ways, ways)
+    vectors = np.stack([b - a, c - a, points - a])
+    (d00, d01, d20), (_, d11, d21), _ = np.einsum("ani,bni->abn", vectors, vectors)
     determinant = np.maximum(d00 * d11 - d01 * d01, 1e-30)
     v = (d11 * d20 - d01 * d21) / determinant
     w = (d00 * d21 - d01 * d20) / determinant
@@ -292,9 +292,9 @@ class Rounding:
 
     def area(self) -> float:
         """Measure the area of the surface, mm^2, by halving edges once and extrapolating."""
-        every = np.arange(len(self._mesh.faces))
+        faces = np.arange(len(self._mesh.faces))
         middles = [
-            self.positions(SurfacePoints(every, np.broadcast_to(middle, (len(every), 3))))
+            self.positions(SurfacePoints(faces, np.broadcast_to(middle, (len(faces), 3))))
             for middle in _MIDDLES
         ]
         corners = np.concatenate([self._mesh.corners(), np.stack(middles, axis=1)], axis=1)

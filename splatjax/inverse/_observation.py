@@ -305,11 +305,11 @@ def compared(
     evidence: Sequence[Evidence],
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
     """Return the pictures, NaN where pixels do not count, and their residuals."""
-    made = tuple(
+    rendered = tuple(
         np.where(np.asarray(pixels)[..., None] > 0, picture, np.nan)
         for picture, pixels in zip(pictures, counted, strict=True)
     )
-    return made, tuple(
+    return rendered, tuple(
         picture - np.asarray(observed.picture)
-        for picture, observed in zip(made, evidence, strict=True)
+        for picture, observed in zip(rendered, evidence, strict=True)
     )

@@ -239,7 +239,7 @@ class RecoveryProblem(eqx.Module):
 
     def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "pixels channels"]:
         together = zip(self.evidence, self.radiance(point), self.counted, strict=True)
-        residuals = [observed.residuals(*made, self.loss) for observed, *made in together]
+        residuals = [observed.residuals(*rendered, self.loss) for observed, *rendered in together]
         return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in residuals])
 
 

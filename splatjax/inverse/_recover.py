@@ -159,8 +159,8 @@ def recover(
         fit = eqx.Partial(fit_near, near=near.variances, weights=weights, rule=rule)
         problem, plans = problem_at(medium, near.variances, fit, plans)
         before = point
-        point, cost, more, converged = search(problem, before)
-        steps += int(more)
+        point, cost, steps_taken, converged = search(problem, before)
+        steps += int(steps_taken)
         reached, size = solution(problem, point), point.size
         chi_squared = cost / max(problem.pixels * channels - size, 1)
         covariance = inverse(np.asarray(reached.information, np.float64)[:size, :size])
@@ -311,8 +311,8 @@ def next_pictures(
         bright = float(np.sqrt(np.mean(radiance**2)))
         scale = max(noise * (bright or 1.0), np.finfo(float).tiny) ** -2
         information = np.asarray(at_point.information, float) * scale
-        more = _marginal(information, medium.channels, len(recovery.information))
-        predictions.append(Prediction(candidate, recovery.covariance(more)))
+        added = _marginal(information, medium.channels, len(recovery.information))
+        predictions.append(Prediction(candidate, recovery.covariance(added)))
     return sorted(predictions, key=lambda prediction: prediction.worst.deviation)
 
 

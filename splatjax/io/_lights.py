@@ -89,9 +89,9 @@ def load_lights(
     with one_sentence(path):
         for name, light, matrix in gltf_nodes(path, "light"):
             color = np.asarray(light.get("color", (1, 1, 1))) * lux * light.get("intensity", 1)
-            place, way = with_y_up(np.stack([matrix[:3, 3], -matrix[:3, 2]]), up)
+            place, direction = with_y_up(np.stack([matrix[:3, 3], -matrix[:3, 2]]), up)
             if light["type"] == "directional":
-                lights.append(DirectionalLight(direction=way, irradiance=color))
+                lights.append(DirectionalLight(direction=direction, irradiance=color))
             else:
                 intensity = mm_per_unit**2 * color
                 lights.append(PointLight(position=mm_per_unit * place, intensity=intensity))
@@ -180,8 +180,8 @@ def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
 
     **Raises:** `ValueError` for a light of another kind than a file can store.
     """
-    for kind, (made, names) in _LIGHTS.items():
-        if type(light) is made:
+    for kind, (record, names) in _LIGHTS.items():
+        if type(light) is record:
             values = {name: getattr(light, name) for name in names if name != "image"}
             plain = {n: plain_numbers(value) for n, value in values.items() if value is not None}
             return {"kind": kind} | ({"image": image} if "image" in names else {}) | plain

@@ -146,9 +146,9 @@ def load_medium(name_or_path: StrPath) -> Medium:
     profile = _profile(tables := _tables(name_or_path))
     if isinstance(profile, Dipole):
         return profile.medium
-    have = "layers or pigments (`load_profile`)" if profile else "Gaussians (`load_material`)"
+    contents = "layers or pigments (`load_profile`)" if profile else "Gaussians (`load_material`)"
     raise ValueError(
-        f"{tables.path}: has no [medium], only its {have}; give a material with coefficients"
+        f"{tables.path}: has no [medium], only its {contents}; give a material with coefficients"
     )
 
 
@@ -260,11 +260,11 @@ def _profile(tables: Table) -> Dipole | LayeredMultipole | Skin | None:
     path, entries = tables.path, tables.entries
     kinds = [kind for kind in _KINDS if kind in tables.entries]
     if len(kinds) > 1 or not (kinds or "fit" in tables.entries):
-        has = (
+        contents = (
             " and ".join(_KINDS[kind] for kind in kinds)
             or f"no {', '.join(_KINDS.values())} or [fit]"
         )
-        raise ValueError(f"{path}: has {has}; give one of them")
+        raise ValueError(f"{path}: has {contents}; give one of them")
     _surface(tables)
     if "openpbr" in kinds:
         entries["medium"] = plain_openpbr(tables.table("openpbr", OPENPBR_ENTRIES))

@@ -317,8 +317,8 @@ def _plan_shadows(
     if isinstance(lights[0], DistantStratum):
         directions = jnp.asarray(_DIRECTIONS, lights[0].direction.dtype)
         lights = [
-            DistantStratum(direction=way, irradiance=lights[0].irradiance, cast_shadows=True)
-            for way in directions
+            DistantStratum(direction=direction, irradiance=lights[0].irradiance, cast_shadows=True)
+            for direction in directions
         ]
     shadows = settings.shadows_of(lights[0])
     merged = shadows.splats_per_disc(parts, bounds)

@@ -219,6 +219,6 @@ def _mean(values: np.ndarray, squared_radius: np.ndarray) -> tuple[np.ndarray, n
     """
     mean, offset = values.mean(axis=0), squared_radius - squared_radius.mean()
     slope = offset @ (values - mean) / max(offset @ offset, np.finfo(float).tiny)
-    left = values - mean - offset[:, None] * slope
+    residual = values - mean - offset[:, None] * slope
     free = max(len(values) - 2, 1)
-    return mean, np.sqrt((left * left).sum(axis=0) / free / len(values))
+    return mean, np.sqrt((residual * residual).sum(axis=0) / free / len(values))

@@ -96,10 +96,10 @@ class Material(eqx.Module):
         factor = self.angular_law()(mu_i)
         if self.single_scattering is None:
             return factor
-        left = jnp.maximum(1 - self.single_scattering.directional_albedo(mu_i), 0)
+        remaining = jnp.maximum(1 - self.single_scattering.directional_albedo(mu_i), 0)
         total = jnp.broadcast_to(self.gaussians.total_reflectance(), factor.shape)
-        is_over = left < factor * total
-        return jnp.where(is_over, left / jnp.where(is_over, total, 1.0), factor)
+        is_over = remaining < factor * total
+        return jnp.where(is_over, remaining / jnp.where(is_over, total, 1.0), factor)
 
     def surface_of(self, gaussians: SumOfGaussians, angles: AngularLaw | None = None) -> "Material":
         """Return a material with other Gaussians and this surface, without single scattering."""

@@ -86,17 +86,17 @@ class Camera(eqx.Module):
         eye, target, up = points
         forward = target - eye
         if not isinstance(points, Tracer):
-            checked, way = np.asarray(points, np.float64), np.asarray(forward, np.float64)
+            checked, direction = np.asarray(points, np.float64), np.asarray(forward, np.float64)
             check_values(
                 "eye, target and up",
                 checked,
                 f"finite and below {_FARTHEST:g} mm",
                 lambda x: np.abs(x) < _FARTHEST,
             )
-            if not np.linalg.norm(way) > 0:
+            if not np.linalg.norm(direction) > 0:
                 raise ValueError(f"eye and target are both {checked[0].tolist()}; move one of them")
-            smallest = _PARALLEL * np.linalg.norm(way) * np.linalg.norm(checked[2])
-            if not np.linalg.norm(np.cross(way, checked[2])) > smallest:
+            smallest = _PARALLEL * np.linalg.norm(direction) * np.linalg.norm(checked[2])
+            if not np.linalg.norm(np.cross(direction, checked[2])) > smallest:
                 raise ValueError(
                     f"up is {checked[2].tolist()}, along the line of sight; give another, such as "
                     "[0, 0, -1] to look down"

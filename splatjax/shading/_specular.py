@@ -46,8 +46,8 @@ def grazing_reflectance(f0: Float[Array, "..."]) -> Float[Array, "..."]:
 
     **Source:** as a step in f0, Lagarde and de Rousiers 2014, Moving Frostbite to PBR.
     """
-    left = jnp.maximum(1 - f0 / _LEAST_F0, 0)
-    return 1 - left * left * left
+    deficit = jnp.maximum(1 - f0 / _LEAST_F0, 0)
+    return 1 - deficit * deficit * deficit
 
 
 def clamped_roughness(roughness: Float[Array, "..."]) -> Float[Array, "..."]:

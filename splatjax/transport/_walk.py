@@ -237,8 +237,8 @@ def fly(
     layer, inside = photons.layer, photons.place == INSIDE
     sigma_s, thickness = of_layer(stack.sigma_s, layer), of_layer(stack.thickness, layer)
     down = uz > 0
-    ahead = jnp.where(down, thickness - photons.depth, photons.depth)
-    to_interface = jnp.maximum(ahead, 0.0) / jnp.maximum(jnp.abs(uz), jnp.finfo(uz.dtype).tiny)
+    vertical = jnp.where(down, thickness - photons.depth, photons.depth)
+    to_interface = jnp.maximum(vertical, 0.0) / jnp.maximum(jnp.abs(uz), jnp.finfo(uz.dtype).tiny)
     to_scatter = jnp.where(
         sigma_s > 0, photons.to_scatter / jnp.where(sigma_s > 0, sigma_s, 1.0), jnp.inf
     )
@@ -253,14 +253,16 @@ def fly(
     reflectance, onward = fresnel(jnp.abs(uz), from_eta, to_eta)
     crosses = ~scattered & (xi[0] > reflectance)
     bent = jnp.where(crosses, from_eta / to_eta, 1.0)
-    after = jnp.where(crosses, layer + jnp.where(down, 1, -1), layer)
-    left = jnp.where(after < 0, ABOVE, jnp.where(after >= stack.sigma_s.shape[0], BELOW, INSIDE))
-    stays = left == INSIDE
+    next_layer = jnp.where(crosses, layer + jnp.where(down, 1, -1), layer)
+    next_place = jnp.where(
+        next_layer < 0, ABOVE, jnp.where(next_layer >= stack.sigma_s.shape[0], BELOW, INSIDE)
+    )
+    stays = next_place == INSIDE
     up_again = jnp.where(crosses, jnp.where(down, onward, -onward), -uz)
     # At an interface the depth is 0 or that of the layer now entered, or met from inside, exactly.
     arrives_on_top = jnp.where(crosses, down, ~down)
     at_interface = jnp.where(
-        arrives_on_top, 0.0, of_layer(stack.thickness, jnp.where(stays, after, layer))
+        arrives_on_top, 0.0, of_layer(stack.thickness, jnp.where(stays, next_layer, layer))
     )
 
     moved = Photons(
@@ -275,8 +277,8 @@ def fly(
         to_scatter=jnp.where(
             scattered, -jnp.log(xi[2]), photons.to_scatter - to_interface * sigma_s
         ),
-        layer=jnp.where(scattered | ~stays, layer, after),
-        place=jnp.where(scattered, INSIDE, left),
+        layer=jnp.where(scattered | ~stays, layer, next_layer),
+        place=jnp.where(scattered, INSIDE, next_place),
         flights=photons.flights + 1,
     )
     moved = jax.tree.map(lambda new, old: jnp.where(inside, new, old), moved, photons)
@@ -293,7 +295,7 @@ def weigh(
     """Update weights along a flight in a layer: absorption is its mean, not sampled."""
     length, scattered = (jnp.broadcast_to(x, weights.carried.shape) for x in (length, scattered))
     removal = of_layer(optics.removal, layer) * length
-    taken = weights.carried * of_layer(optics.absorption, layer) * length * mean_decay(removal)
+    absorbed = weights.carried * of_layer(optics.absorption, layer) * length * mean_decay(removal)
     ratio = jnp.where(scattered, of_layer(optics.ratio, layer), 1.0)
     layers = jnp.broadcast_to(
         jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None],
@@ -302,5 +304,6 @@ def weigh(
     is_in_layer = jnp.broadcast_to(layer, layers.shape) == layers
     return PathWeights(
         weights.carried * jnp.exp(-removal) * ratio,
-        weights.absorbed + jnp.where(is_in_layer, jnp.broadcast_to(taken, is_in_layer.shape), 0.0),
+        weights.absorbed
+        + jnp.where(is_in_layer, jnp.broadcast_to(absorbed, is_in_layer.shape), 0.0),
     )
