@@ -51,10 +51,7 @@ def make_plans(
     """Make a plan for each picture. Pictures share plans where possible, so that nothing is
     compiled twice.
     """
-    keys = [
-        (jax.tree.structure(view.camera), jax.tree.structure(view.lights))
-        for view in pictured_scenes
-    ]
+    keys = [jax.tree.structure((view.camera, view.lights)) for view in pictured_scenes]
     plans = {}
     for key in dict.fromkeys(keys):
         alike = [
