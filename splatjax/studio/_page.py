@@ -75,7 +75,7 @@ class Page:
             import viser
         except ImportError:
             raise ValueError(
-                "the page of the studio needs viser; install it: pip install './splatjax[studio]' beside the checkout"
+                "the page of the studio needs viser; install it: pip install viser"
             ) from None
         folder.mkdir(exist_ok=True)
         self._session, self._where = session, (folder, recipe or {})
