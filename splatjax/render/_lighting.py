@@ -251,6 +251,21 @@ def irradiance_at_splats(scene: Scene, light: LightVisibility) -> Irradiance:
     return irradiance_at_points(scene.material, light, *points, surface_parameters(scene)[1])
 
 
+def source_derivative(scene: Scene, light: LightVisibility) -> Float[Array, "channels splats"]:
+    """Differentiate the source in the weights.
+
+    With single scattering, less light is left for the Gaussians at grazing angles. This depends
+    only on the sum of the weights, so the derivative is taken in one weight.
+    """
+
+    def source(weights: Float[Array, "gaussians channels"]):
+        changed = eqx.tree_at(lambda s: s.material.gaussians.weights, scene, weights)
+        return irradiance_at_splats(changed, light).source
+
+    weights = scene.material.gaussians.weights
+    return jax.jvp(source, (weights,), (jnp.zeros_like(weights).at[0].set(1),))[1]
+
+
 def single_scattering_at_splats(
     scene: Scene, light: LightVisibility, eye: Float[Array, "3"]
 ) -> Float[Array, "channels splats"] | None:

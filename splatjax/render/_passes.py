@@ -23,6 +23,7 @@ from ._lighting import (
     beams_at_splats,
     cast_shadows,
     irradiance_at_splats,
+    source_derivative,
     surface_parameters,
 )
 from ._plan import Plan
@@ -115,7 +116,7 @@ class Passes(eqx.Module):
         kernel, combination = self.settings.kernel, self.combination
         if derivative:
             if material.single_scattering is not None:
-                added = _source_derivative(self.scene, light)
+                added = source_derivative(self.scene, light)
                 source = jnp.concatenate([source, added])
             sources = _diffusion.Sources.of(splats, source)
             diffused, differentiated = self.plan.diffusion.diffuse_with_derivative(
@@ -280,21 +281,6 @@ class Passes(eqx.Module):
         at_once = 2 * _splatting.TILES_AT_ONCE
         values = map_chunks(sample_and_read, visible.sums, visible.tiles, at_once=at_once)
         return self.combination.gather(values), visible.gathered(self.combination)
-
-
-def _source_derivative(scene: Scene, light: LightVisibility) -> Float[Array, "channels splats"]:
-    """Differentiate the source in the weights.
-
-    With single scattering, less light is left for the Gaussians at grazing angles. This depends
-    only on the sum of the weights, so the derivative is taken in one weight.
-    """
-
-    def source(weights: Float[Array, "gaussians channels"]):
-        changed = eqx.tree_at(lambda s: s.material.gaussians.weights, scene, weights)
-        return irradiance_at_splats(changed, light).source
-
-    weights = scene.material.gaussians.weights
-    return jax.jvp(source, (weights,), (jnp.zeros_like(weights).at[0].set(1),))[1]
 
 
 def sample_surfaces(
