@@ -40,6 +40,9 @@ def arguments():
         action="store_true",
         help="the whole frame alone, without its passes and gradients",
     )
+    parser.add_argument(
+        "--summed", action="store_true", help="sum the layers at the splats (ExitanceDiffuser)"
+    )
     return parser.parse_args()
 
 
@@ -104,10 +107,14 @@ def timed(function: Callable, inputs: tuple) -> float:
 
 
 def cases_of(
-    scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, frame_only: bool
+    scene: sj.Scene,
+    camera: sj.Camera,
+    plan: sj.Plan,
+    settings: sj.RenderSettings,
+    frame_only: bool,
+    summed: bool,
 ) -> dict[str, tuple]:
     """Return what is timed, by name: functions and their arguments."""
-    settings = sj.RenderSettings()
 
     def frame(scene):
         return sj.render(scene, camera, settings, plan)
@@ -126,8 +133,8 @@ def cases_of(
         "passes 2+3 with gradients": (backward, inputs),
         "all five passes": (frame, (scene,)),
         "all five passes with gradients": (jax.grad(mean), (scene,)),
-        "all five passes with the Jacobian in the material": (jacobian, (scene,)),
         **passes(scene, camera, plan, settings),
+        **({} if summed else {"all five passes with the Jacobian": (jacobian, (scene,))}),
     }
 
 
@@ -135,16 +142,21 @@ def main() -> None:
     options = arguments()
     data = columns(options.body, options.splats)
     scene, camera = lit(data, options.width)
-    sj.make_plan(scene, camera)
+    diffuser = sj.diffusion.ClusterDiffuser()
+    settings = sj.RenderSettings(
+        diffuser=sj.diffusion.ExitanceDiffuser(diffuser) if options.summed else diffuser
+    )
+    sj.make_plan(scene, camera, settings)
     start = time.perf_counter()
-    plan = sj.make_plan(scene, camera)
+    plan = sj.make_plan(scene, camera, settings)
     planning = 1e3 * (time.perf_counter() - start)
-    if float(sj.render(scene, camera, plan=plan).overflow) > 0:
+    if float(sj.render(scene, camera, settings, plan).overflow) > 0:
         raise SystemExit(
             f"{options.splats} splats at {options.width}^2: the plan's capacity is exceeded"
         )
     rows, compiled = {}, {}
-    for name, (function, inputs) in cases_of(scene, camera, plan, options.frame_only).items():
+    cases = cases_of(scene, camera, plan, settings, options.frame_only, options.summed)
+    for name, (function, inputs) in cases.items():
         start = time.perf_counter()
         compiled[name] = jax.jit(function).lower(*inputs).compile(), inputs
         seconds = time.perf_counter() - start
@@ -162,10 +174,14 @@ def main() -> None:
             for name, case in compiled.items():
                 times[name].append(timed(*case))
     medians = yardstick.medians()
-    common = {"body": options.body, "splats": options.splats, "width": options.width}
-    common |= {f"{name.replace(' ', '_')}_milliseconds": value for name, value in medians.items()}
-    common |= {"planning_milliseconds": planning}
-    common |= {"process_gigabytes": 1e-6 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
+    common = {
+        "body": options.body,
+        "splats": options.splats,
+        "width": options.width,
+        **{f"{name.replace(' ', '_')}_milliseconds": value for name, value in medians.items()},
+        "planning_milliseconds": planning,
+        "process_gigabytes": 1e-6 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+    }
     unit = medians["yardstick"]
     for name, row in rows.items():
         value = float(np.median(times[name]))

@@ -34,6 +34,10 @@ def render(
     r"""Render a picture with all its layers: shadow maps, visibility, attributes, diffusion,
     shading.
 
+        plan = make_plan(scene, camera)
+        frame = render(scene, camera, plan=plan)
+        gradient = eqx.filter_grad(lambda scene: render(scene, camera, plan=plan).beauty.mean())
+
     **Arguments:**
 
     - `scene`: splats (mm), lights and material. Differentiable; the choice of visible splats is
