@@ -135,7 +135,8 @@ def plain_scene(
     """Return the contents of a scene's file; [splats] and [[lights]] are given."""
     pose = {name: getattr(camera, name) for name in (*_POSE, "principal_point")}
     pose = {name: plain_numbers(value) for name, value in pose.items() if value is not None}
-    diffusion = next(n for n, kind in DIFFUSERS.items() if kind == settings.diffuser)
+    kinds = {type(diffuser): name for name, diffuser in DIFFUSERS.items()}
+    diffusion = kinds.get(type(settings.diffuser), "clusters")
     return {
         "material": plain_material(material),
         "splats": dict(splats),

@@ -61,6 +61,9 @@ def test_a_scene_comes_back_from_its_file_and_from_a_manifest(tmp_path):
     (tmp_path / "pictures").mkdir()
     sj.write_exr(tmp_path / "pictures" / "a.exr", some_frame(), manifest=manifest)
     close(load_scene(tmp_path / "pictures" / "a.exr"), (scene, camera, SHAPE))
+    for diffuser in (sj.diffusion.ExitanceDiffuser(), sj.diffusion.ClusterDiffuser()):
+        save_scene(tmp_path / "b.toml", scene, camera, sj.RenderSettings(diffuser=diffuser))
+        assert load_scene(tmp_path / "b.toml")[2].diffuser == diffuser
     with pytest.raises(ValueError, match=r"a\.toml: stores only bounces"):
         save_scene(
             tmp_path / "a.toml", scene, camera, replace(SHAPE, kernel=sj.diffusion.PlainMean())
