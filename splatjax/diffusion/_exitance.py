@@ -19,6 +19,7 @@ from ._diffuser import (
     one_layer,
 )
 from ._points import LayersAtPoints
+from ._shape import ShapeDiffuser
 
 
 class ExitanceDiffuser(AbstractDiffuser):
@@ -33,10 +34,17 @@ class ExitanceDiffuser(AbstractDiffuser):
 
     **Attributes:**
 
-    - `layers`: the diffuser of the layers.
+    - `layers`: the diffuser of the layers, one for each Gaussian.
     """
 
     layers: AbstractDiffuser = ClusterDiffuser()
+
+    def __check_init__(self):
+        if isinstance(self.layers, ShapeDiffuser | ExitanceDiffuser):
+            raise ValueError(
+                f"ExitanceDiffuser.layers is a {type(self.layers).__name__}, which has no layers "
+                "to sum; use it directly, or give ClusterDiffuser()"
+            )
 
     def make_plan(self, parts, variances, kernel, interval):
         layers = self.layers.make_plan(parts, variances, kernel, interval)
@@ -79,7 +87,7 @@ class ExitancePlan(AbstractDiffusionPlan):
 
         @jax.checkpoint
         def exitance(layers: LayerValues, source, area, albedo, factors) -> LayerValues:
-            offset, factors = LayersAtPoints.of(
+            offset, of_means = LayersAtPoints.of(
                 material.gaussians.variances,
                 self.layers.gaussians,
                 layers.values,
@@ -91,10 +99,10 @@ class ExitancePlan(AbstractDiffusionPlan):
                 kernel,
                 factors,
             ).linear_in_means(material.gaussians, material.single_scattering_albedo())
-            factors = factors.at[self.layers.gaussians].get(mode="fill", fill_value=0)
+            of_means = of_means.at[self.layers.gaussians].get(mode="fill", fill_value=0)
             means, slopes = layers.values[:, :-1], layers.slopes[:, :-1]
-            total = offset + jnp.sum(factors * means, axis=0)
-            return LayerValues(total[None], jnp.sum(factors[:, :, None] * slopes, axis=0)[None])
+            total = offset + jnp.sum(of_means * means, axis=0)
+            return LayerValues(total[None], jnp.sum(of_means[:, :, None] * slopes, axis=0)[None])
 
         layers = exitance(diffused.layers, *along_splats)
         return dataclasses.replace(diffused, layers=layers), None

@@ -250,7 +250,7 @@ class Passes(eqx.Module):
         centers = splats.centers.T - origin
         attributes = dataclasses.replace(
             attributes,
-            weights=attributes.weights if shown.splats.weights is not None else None,
+            weights=None if shown.splats.weights is None else attributes.weights,
             centers=centers,
             layers=_diffusion.continue_from_splats(layers, centers),
             derivative=light.derivative

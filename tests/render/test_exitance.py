@@ -20,7 +20,7 @@ from bodies import (
 from jax.test_util import check_grads
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser, ExitanceDiffuser, PlainMean
+from splatjax.diffusion import DenseDiffuser, ExitanceDiffuser, PlainMean, ShapeDiffuser
 
 SUMMED = dataclasses.replace(PLAIN, diffuser=ExitanceDiffuser(DenseDiffuser()))
 ERROR = 1e-2  # of the largest value: the gain is blended instead of the mass that it depends on
@@ -86,3 +86,8 @@ def test_layers_of_their_own_are_refused():
     for render in (sj.diffusion_basis, sj.picture_jacobian):
         with pytest.raises(ValueError, match="DenseDiffuser"):
             render(of, view(), SUMMED, plan)
+    with pytest.raises(ValueError, match="ExitanceDiffuser has no separate layers"):
+        sj.diffuse_irradiance(of, jnp.ones((100, 3)), view(), SUMMED, plan)
+    for diffuser in (ShapeDiffuser(), ExitanceDiffuser()):
+        with pytest.raises(ValueError, match=rf"layers is a {type(diffuser).__name__}"):
+            ExitanceDiffuser(diffuser)
