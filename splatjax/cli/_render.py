@@ -5,7 +5,7 @@ animation, which resume after an interruption.
 import functools
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -130,7 +130,9 @@ class Render(ViewOptions):
         return self._drawn(scene, camera, settings)
 
     def _drawn(self, scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings) -> Rendered:
-        with preview(lambda side: rough_picture(scene, camera, self.exposure, side)):
+        # Before the preview, which is drawn within the first compilation, so that none is nested.
+        samples = [sample for light in scene.lights for sample in light.samples()]
+        with preview(lambda side: rough_picture(scene, samples, camera, self.exposure, side)):
             with stage("planning"):
                 plan = sj.make_plan(scene, camera, settings)
             size = f"{camera.width} x {camera.height}"
@@ -276,12 +278,13 @@ class Turntable(ViewOptions):
         return make
 
 
-def rough_picture(scene: sj.Scene, camera: sj.Camera, exposure: float, side: int) -> list:
-    """Draw the centers of splats, matte and under directional lights, by NumPy alone, which
+def rough_picture(
+    scene: sj.Scene, samples: Sequence[Any], camera: sj.Camera, exposure: float, side: int
+) -> list:
+    """Draw the centers of splats, matte and under samples of the lights, by NumPy alone, which
     compiles nothing. The longer side has so many pixels at most, fewer for few splats; the height
     is even. Return rows of red, green and blue up to 255.
     """
-    samples = [sample for light in scene.lights for sample in light.samples()]
     scene, camera, lights = jax.device_get((scene, camera, samples))
     # Of millions of splats some will do.
     splats = jax.tree.map(lambda leaf: leaf[:: 1 + len(leaf) // 2**19], scene.splats)

@@ -54,7 +54,9 @@ def test_a_preview_is_shown_while_the_picture_compiles_and_only_then(plain, cons
 def test_a_preview_is_upright_and_lit_from_where_the_light_is():
     lights = sj.DirectionalLight([-0.8, -0.6, -0.2], [1.0, 2.0, 3.0])
     scene = sj.Scene(sphere(3000, jitter=0.0), lights, sj.load_material("marble"))
-    picture = np.asarray(rough_picture(scene, view((0.0, 0.0, 40.0), size=32), 0.0, 28))
+    picture = np.asarray(
+        rough_picture(scene, lights.samples(), view((0.0, 0.0, 40.0), size=32), 0.0, 28)
+    )
     red, _, blue = np.moveaxis(picture, 2, 0)
     assert picture.shape == (28, 28, 3)
     assert np.all(red[red > 0] < blue[red > 0])
@@ -63,6 +65,21 @@ def test_a_preview_is_upright_and_lit_from_where_the_light_is():
     assert np.all(red[:, :2] == 0)
     assert red[:, 14:].sum() > 1.5 * red[:, :14].sum()
     assert red[:14].sum() > 1.3 * red[14:].sum()
+
+
+def test_a_preview_compiles_nothing(compiled):
+    """It is drawn while JAX compiles a program, which may be one that it would need."""
+    lights = sj.EnvironmentLight(np.ones((6, 12, 3)), count=16)
+    scene, camera = (
+        sj.Scene(sphere(3000), lights, sj.load_material("marble")),
+        view((0.0, 0.0, 40.0)),
+    )
+    samples = lights.samples()
+    jax.clear_caches()
+    before = len(compiled)
+    assert before > 0
+    rough_picture(scene, samples, camera, 0.0, 28)
+    assert len(compiled) == before
 
 
 @pytest.mark.parametrize(
