@@ -40,10 +40,10 @@ class BlendingRasterizer(AbstractListRasterizer):
             weight = jnp.where(in_front, fragments.weight, 0.0)
             rows = attributes.at[:, ids].get(mode="fill", fill_value=0)
             sums = jnp.einsum("rts,tsp->trp", rows, weight)
-            own = jnp.stack(
+            totals = jnp.stack(
                 [jnp.sum(weight * fragments.nearness, axis=1), jnp.sum(weight, axis=1)], axis=1
             )
-            return jnp.concatenate([sums, own], axis=1)
+            return jnp.concatenate([sums, totals], axis=1)
 
         sums = lists.reduce_blocks(jax.ops.segment_sum, lists.map_blocks(blend, limits))
         sums = sums.reshape(-1, *sums.shape[2:])

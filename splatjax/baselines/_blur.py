@@ -27,9 +27,11 @@ class BlurSums(eqx.Module):
             is_trusted[None], self.sums / jnp.where(is_trusted, self.trusted, 1.0)[None], 0.0
         )
 
-    def filled(self, own: Float[Array, "rows height width"]) -> Float[Array, "rows height width"]:
+    def filled(
+        self, values: Float[Array, "rows height width"]
+    ) -> Float[Array, "rows height width"]:
         """Compute the mean over all taps, with the pixel's own value for what was not trusted."""
-        return (self.sums + (self.total - self.trusted)[None] * own) / self.total[None]
+        return (self.sums + (self.total - self.trusted)[None] * values) / self.total[None]
 
 
 def blur_along(

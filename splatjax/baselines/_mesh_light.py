@@ -132,8 +132,8 @@ def mesh_light(
         grid = _splatting.TileGrid(view.width, view.height)
         depth = grid.cut(jnp.where(seen.covered, surface[5], 1.0)[None])[:, 0]
         coverage = grid.cut(seen.covered.astype(surface.dtype)[None])[:, 0]
-        nothing = jnp.zeros_like(depth)
-        planes = jnp.stack([depth, coverage, nothing, nothing])
+        zeros = jnp.zeros_like(depth)
+        planes = jnp.stack([depth, coverage, zeros, zeros])
         depths = _splatting.ShadowMap(view, planes, seen.needed)
         shadows.append(MeshShadow(light, depths, grid.cut(surface[:5])))
         needed = jnp.maximum(needed, seen.needed)

@@ -40,6 +40,6 @@ class NearestRasterizer(AbstractListRasterizer):
             for pixel in lists.grid.columns_and_rows(lists.bins.order)
         )
         fragments = self.kernel.fragments(footprint, view, x - footprint.x, y - footprint.y)
-        own = jnp.stack([fragments.nearness, jnp.ones_like(x)])
-        rows = jnp.concatenate([attributes[:, ids], own])
+        totals = jnp.stack([fragments.nearness, jnp.ones_like(x)])
+        rows = jnp.concatenate([attributes[:, ids], totals])
         return jnp.where(is_covered[None], rows, 0.0).transpose(1, 0, 2)

@@ -170,8 +170,10 @@ def diffuse_in_texture(
             blurred, valid, variance - spent, channels, reaches[2 * step : 2 * step + 2]
         )
         spent = variance
-        own = blurred[:channels].reshape(channels, -1)
-        mean, mass = _with_far_side(own, blurred[channels + 2 :], far, valid, variance, settings)
+        near_side = blurred[:channels].reshape(channels, -1)
+        mean, mass = _with_far_side(
+            near_side, blurred[channels + 2 :], far, valid, variance, settings
+        )
         means.append(mean)
         masses.append(mass)
         lost.append(1 - jnp.sum(kept) / jnp.sum(valid))
@@ -218,15 +220,15 @@ def _spread(rows, valid, variance, channels: int, reaches: tuple[int, ...]):
 
 
 def _with_far_side(
-    own, nearness, far: FarSide | None, valid, variance, settings: TextureSpaceSettings
+    near_side, nearness, far: FarSide | None, valid, variance, settings: TextureSpaceSettings
 ):
     """Compute mean and kernel mass of the texel's own surroundings and of the far side."""
     if far is None:
-        return own, jnp.ones_like(own[:1])
+        return near_side, jnp.ones_like(near_side[:1])
     depth = settings.kernel.depths(variance[None])[0]
     share = far.share(nearness.reshape(nearness.shape[0], -1), variance, depth)
-    picture = own.T.reshape(*valid.shape, -1)
-    total, weight = own, jnp.ones_like(own[:1])
+    picture = near_side.T.reshape(*valid.shape, -1)
+    total, weight = near_side, jnp.ones_like(near_side[:1])
     for uvs, own_share in zip(far.uvs, share, strict=True):
         total = total + own_share[None] * look_up_charts(picture, valid, uvs).T
         weight = weight + own_share[None]

@@ -179,8 +179,8 @@ def look_up_charts(
     share = total[:, 0]
     for weight, row, column in zip(weights, rows, columns, strict=True):
         at = jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)
-        known = weight * valid[at]
-        total, share = total + known[:, None] * picture[at], share + known
+        trust = weight * valid[at]
+        total, share = total + trust[:, None] * picture[at], share + trust
     return jnp.where(share[:, None] > 0, total / jnp.where(share > 0, share, 1.0)[:, None], 0.0)
 
 

@@ -112,17 +112,23 @@ class Lists(eqx.Module):
         last = self.bins.order.shape[0] // grid.lanes - 1
 
         @jax.checkpoint
-        def one(ids, chunk):
+        def map_block(ids, chunk):
             chunk = jnp.minimum(chunk, last)
             tile = jax.lax.dynamic_slice_in_dim(self.bins.order, chunk * grid.lanes, grid.lanes)
             x, y = (pixel.astype(dtype)[:, None] + 0.5 for pixel in grid.columns_and_rows(tile))
-            own = jax.tree.map(
+            footprints = jax.tree.map(
                 lambda plane: plane.at[ids].get(mode="fill", fill_value=0)[:, :, None],
                 self.footprints,
             )
-            return look(ids, own, x - own.x, y - own.y, *(values[chunk] for values in more))
+            return look(
+                ids,
+                footprints,
+                x - footprints.x,
+                y - footprints.y,
+                *(values[chunk] for values in more),
+            )
 
-        return jax.lax.map(lambda block: one(*block), (self.bins.ids, self.chunk))
+        return jax.lax.map(lambda block: map_block(*block), (self.bins.ids, self.chunk))
 
     def reduce_blocks(self, combine: Callable, results: jax.Array) -> jax.Array:
         """Combine what the blocks of each chunk found, by a segment reduction: `[chunks, lanes,

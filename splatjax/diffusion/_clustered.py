@@ -68,9 +68,11 @@ class ClusterDiffuser(AbstractDiffuser):
             np.asarray(variances, np.float64), spacing, fine, kernel, interval
         )
         clusters = LayerSources.build(centers, normals, exists, edges.tolist())
-        rows = (jnp.asarray(each) for each in (centers.T, normals.T, areas, areas[None]))
-        own = jnp.asarray(sizes, variances.dtype)
-        points, boxes, sinking = _enclose(clusters, Sources(*rows), own, self.margin, kernel)
+        rows = (jnp.asarray(array) for array in (centers.T, normals.T, areas, areas[None]))
+        layer_variances = jnp.asarray(sizes, variances.dtype)
+        points, boxes, sinking = _enclose(
+            clusters, Sources(*rows), layer_variances, self.margin, kernel
+        )
         # Sources of a wider layer lie deeper than those of the boxes.
         sinking = math.sqrt(3) * np.asarray(sinking, np.float64)
         reaches = np.where(edges < np.inf, supports * np.sqrt(sizes * self.margin) + sinking, 0)
@@ -103,8 +105,8 @@ class ClusterDiffuser(AbstractDiffuser):
         **Returns:** of each its Gaussian, the variance (mm^2), the edge of its cells (mm; 0 for
         single splats), and the support (standard deviations).
         """
-        given = (jnp.asarray(each, interval.dtype) for each in (variances * self.margin, fine))
-        shares = np.asarray(eqx.filter_jit(resolved_fraction)(*given, interval), np.float64)
+        inputs = (jnp.asarray(value, interval.dtype) for value in (variances * self.margin, fine))
+        shares = np.asarray(eqx.filter_jit(resolved_fraction)(*inputs, interval), np.float64)
         edges = _CELL * (self.error / 2e-3) ** (1 / 3) * np.sqrt(variances / self.margin)
         edges = np.where(edges > _WORTHWHILE * spacing, edges, 0.0)
         gaussians = np.flatnonzero(shares > 0)
@@ -112,8 +114,8 @@ class ClusterDiffuser(AbstractDiffuser):
         supports = [kernel.support(self.error, share) for share in shares[gaussians].tolist()]
         chosen = gaussians, variances[gaussians], edges[gaussians], np.array(supports, float)
         return tuple(
-            np.pad(each, (0, lacking), constant_values=fill)
-            for each, fill in zip(chosen, (len(variances), 1, np.inf, 1), strict=True)
+            np.pad(column, (0, lacking), constant_values=fill)
+            for column, fill in zip(chosen, (len(variances), 1, np.inf, 1), strict=True)
         )
 
 
@@ -150,8 +152,8 @@ class ClusterPlan(AbstractDiffusionPlan):
         origin = jax.lax.stop_gradient(jnp.mean(everywhere.centers, axis=1))[:, None]
         centered = dataclasses.replace(everywhere, centers=everywhere.centers - origin)
         points = sources.centers - origin
-        own = self.variances_of_layers(variances)
-        depths = kernel.depths(own)
+        layer_variances = self.variances_of_layers(variances)
+        depths = kernel.depths(layer_variances)
 
         # Sink the sources and merge them; sum over those near each block of points.
         below = self.sources.merged(centered, depths)
@@ -160,26 +162,26 @@ class ClusterPlan(AbstractDiffusionPlan):
         if at is not None:
             lists = lists.only(jnp.any(targets.ranks < targets.count, axis=1))
         sums = gaussian_sums(
-            in_units(points.reshape(3, -1, POINTS_PER_BLOCK).swapaxes(0, 1), own),
-            source_table(below, own, self.sources.layers),
+            in_units(points.reshape(3, -1, POINTS_PER_BLOCK).swapaxes(0, 1), layer_variances),
+            source_table(below, layer_variances, self.sources.layers),
             lists,
             self.kernels,
             targets,
             self.forward_mode,
         )
-        per_mm = units_per_mm(own)[:, None]
+        per_mm = units_per_mm(layer_variances)[:, None]
         seen = points if at is None else take_points(points, at)
         layers = jax.checkpoint(layer_values)(  # keeps the sums alone for the derivative
-            sums.reshape(len(own), -1, 4, targets.count),
+            sums.reshape(len(layer_variances), -1, 4, targets.count),
             per_mm[:, None] * seen[None],
             2 * per_mm,  # slopes are moments in mm over v, and moments are in units of sqrt(2 v)
-            per_flat_mass(self.kernels, own, depths)[:, None],
+            per_flat_mass(self.kernels, layer_variances, depths)[:, None],
         )
 
         # The needed over the planned capacity.
         around = _target_boxes(points, sources.areas), source_boxes(below)
-        largest = self.kernels.largest.astype(own.dtype)
-        reaches = jnp.sqrt(2 * largest * jax.lax.stop_gradient(own))
+        largest = self.kernels.largest.astype(layer_variances.dtype)
+        reaches = jnp.sqrt(2 * largest * jax.lax.stop_gradient(layer_variances))
         planned = self.variances[: len(variances)]
         factors = jnp.maximum(planned / variances, variances / planned)
         varied = jnp.max(factors, initial=0) / (self.margin * (1 + 1e-6))

@@ -67,10 +67,10 @@ class LayerSources(eqx.Module):
         nested = dict(zip(cells, nested_cells(centers, normals, exists, cells), strict=True))
         nested[0.0] = np.arange(len(exists), dtype=np.int32), len(exists)
         nested[np.inf] = np.full(len(exists), np.iinfo(np.int32).max // 2, np.int32), 0
-        own, members = zip(*(nested[edge] for edge in edges), strict=True)
-        blocks = -(-np.asarray(members) // SOURCES_PER_BLOCK)
+        cells_of_splats, counts = zip(*(nested[edge] for edge in edges), strict=True)
+        blocks = -(-np.asarray(counts) // SOURCES_PER_BLOCK)
         layers, ends = np.repeat(np.arange(len(edges)), blocks), np.cumsum(blocks)
-        parents = np.stack(own) + SOURCES_PER_BLOCK * (ends - blocks)[:, None]
+        parents = np.stack(cells_of_splats) + SOURCES_PER_BLOCK * (ends - blocks)[:, None]
         half = -(-len(exists) // (2 * SOURCES_PER_BLOCK)) * SOURCES_PER_BLOCK
         count = SOURCES_PER_BLOCK * len(layers)
         capacity = max(-(-count // half), -(-3 * len(edges) // 2)) * half
@@ -143,9 +143,9 @@ def nested_cells(
         order = compact_order(positions)
         positions, facing, members = positions[order], facing[order], inside[order]
         of_splats = np.argsort(order)[parent][of_splats]
-        own = np.zeros(len(exists), np.int32)
-        own[exists] = of_splats
-        levels.append((own, len(order)))
+        cell_of_splat = np.zeros(len(exists), np.int32)
+        cell_of_splat[exists] = of_splats
+        levels.append((cell_of_splat, len(order)))
     return levels
 
 
@@ -162,11 +162,11 @@ def _split_by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
     is_split = np.zeros(groups.max() + 1, bool)
     is_split[groups[backs]] = True
     chosen = np.flatnonzero(is_split[groups])
-    own, ways = (np.cumsum(is_split) - 1)[groups[chosen]], facing[chosen]
-    products = _sums(own, (ways[:, :, None] * ways[:, None]).reshape(-1, 9))
+    chosen_groups, ways = (np.cumsum(is_split) - 1)[groups[chosen]], facing[chosen]
+    products = _sums(chosen_groups, (ways[:, :, None] * ways[:, None]).reshape(-1, 9))
     axes = np.linalg.eigh(products.reshape(-1, 3, 3))[1][:, :, -1]
     sides = 2 * groups
-    sides[chosen] += np.sum(ways * axes[own], axis=1) < 0
+    sides[chosen] += np.sum(ways * axes[chosen_groups], axis=1) < 0
     return (np.cumsum(np.bincount(sides) > 0) - 1)[sides]
 
 
@@ -189,11 +189,11 @@ def compact_order(points: np.ndarray) -> np.ndarray:
         turn = np.argpartition(part[np.argmax(np.ptp(part, axis=1))], middle - begin - 1)
         order[begin:end], coordinates[:, begin:end] = order[begin:end][turn], part[:, turn]
         todo += [(begin, middle), (middle, end)]
-    together, whole = (len(points) // size * size for size in (_TOGETHER, POINTS_PER_BLOCK))
+    together, in_blocks = (len(points) // size * size for size in (_TOGETHER, POINTS_PER_BLOCK))
     for begin in range(0, together, _TOGETHER):
         part = slice(begin, begin + _TOGETHER)
         _halve(order[part], coordinates[:, part], _TOGETHER)
-    _halve(order[together:whole], coordinates[:, together:whole], POINTS_PER_BLOCK)
+    _halve(order[together:in_blocks], coordinates[:, together:in_blocks], POINTS_PER_BLOCK)
     return order
 
 

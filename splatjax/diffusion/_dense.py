@@ -57,9 +57,9 @@ def dense_layers(
     """Evaluate layers at any points, untruncated."""
 
     def evaluate(layer):
-        *given, light = layer
-        own = sources if light is None else dataclasses.replace(sources, irradiance=light)
-        return dense_layer(own, points, *given)
+        variance, depth, light = layer
+        lit = sources if light is None else dataclasses.replace(sources, irradiance=light)
+        return dense_layer(lit, points, variance, depth)
 
     lights = sources.irradiance.swapaxes(0, 1) if sources.irradiance.ndim == 3 else None
     return jax.lax.map(evaluate, (variances, kernel.depths(variances), lights))

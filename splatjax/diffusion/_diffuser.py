@@ -169,8 +169,8 @@ class AbstractDiffusionPlan(eqx.Module):
 
         **Returns:** the layers, and the solution on all splats that `towards` needs.
         """
-        given = Sources.of(splats, source), material.gaussians.variances, kernel, combination, at
-        return self.diffuse(*given), None
+        sources, variances = Sources.of(splats, source), material.gaussians.variances
+        return self.diffuse(sources, variances, kernel, combination, at), None
 
     def towards(
         self,

@@ -76,8 +76,9 @@ class ExitancePlan(AbstractDiffusionPlan):
         return self.layers.shares()
 
     def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
-        given = beams, kernel, combination, at, bounced
-        diffused, _ = self.layers.light(splats, material, source, *given)
+        diffused, _ = self.layers.light(
+            splats, material, source, beams, kernel, combination, at, bounced
+        )
         at = jnp.arange(splats.count) if at is None else at
         factors = Sources.of(splats, source).weights
         albedo = jnp.ones_like(source) if splats.albedo is None else splats.albedo.T

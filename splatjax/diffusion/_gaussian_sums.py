@@ -44,18 +44,18 @@ class SourceTable(eqx.Module):
         """Compute the summed rows and moments."""
         if not self.moments:
             return self.rows
-        each = jnp.stack(
+        products = jnp.stack(
             [self.rows, *(self.rows * center[:, None] for center in self.centers)], axis=2
         )
-        return each.reshape(len(each), -1, each.shape[-1])
+        return products.reshape(len(products), -1, products.shape[-1])
 
     def gather(self, ids: Int[Array, "lanes width"]) -> "SourceTable":
         """Read the blocks of each lane, `[lanes, sources]` and `[lanes, rows, sources]`."""
         x, y, z, rows = (
-            each.at[ids].get(mode="fill", fill_value=0) for each in (*self.centers, self.rows)
+            plane.at[ids].get(mode="fill", fill_value=0) for plane in (*self.centers, self.rows)
         )
         rows = jnp.moveaxis(rows, 1, 2).reshape(len(ids), rows.shape[2], -1)
-        centers = tuple(each.reshape(len(ids), -1) for each in (x, y, z))
+        centers = tuple(plane.reshape(len(ids), -1) for plane in (x, y, z))
         return SourceTable(centers, rows, self.moments)
 
     def scatter_add(
@@ -132,12 +132,12 @@ class _Sweep(eqx.Module):
         """Sum over all sources of the points: `add(lanes, ids, kernels, points, sums)`."""
         block = points.shape[2]
 
-        def sweep(lanes: Lanes, kernels, here, out):
-            start = jnp.zeros((len(here), table.count, block), here.dtype)
-            found = lanes.each_row(
-                self.lists, lambda ids, sums: add(lanes, ids, kernels, here, sums), start
+        def sweep(lanes: Lanes, kernels, x, out):
+            start = jnp.zeros((len(x), table.count, block), x.dtype)
+            lane_sums = lanes.each_row(
+                self.lists, lambda ids, sums: add(lanes, ids, kernels, x, sums), start
             )
-            return self.targets.write(out, lanes, found)
+            return self.targets.write(out, lanes, lane_sums)
 
         layers = len(self.kernels.largest)
         out = zeros_after(table.rows, (layers, table.count, self.targets.count), points.dtype)
@@ -154,13 +154,13 @@ def _weigh(kernels: TruncatedGaussian, points, sources: SourceTable):
     return *kernels(dx * dx + dy * dy + dz * dz), (dx, dy, dz)
 
 
-def _forward(given: _Sweep, points, table: SourceTable):
-    def add(lanes, ids, kernels, here, sums):
+def _forward(sweeps: _Sweep, points, table: SourceTable):
+    def add(lanes, ids, kernels, x, sums):
         sources = table.gather(ids)
-        weights, *_ = _weigh(kernels, here, sources)
+        weights, *_ = _weigh(kernels, x, sources)
         return sums + jnp.einsum("lrs,lsp->lrp", sources.rows_and_moments(), weights)
 
-    return given.sums(points, table, add)
+    return sweeps.sums(points, table, add)
 
 
 @full_precision
@@ -175,19 +175,19 @@ def _backward(residuals, cotangents):
     Both are moments of `g` over one side. Points and sources are relative to one of the sources, so
     that float32 does not cancel.
     """
-    given, points, table = residuals
+    sweeps, points, table = residuals
 
-    def sweep(lanes: Lanes, kernels, here, carry):
+    def sweep(lanes: Lanes, kernels, lane_points, carry):
         d_points, d_table = carry
-        cotangent = given.targets.read(cotangents, lanes)
+        cotangent = sweeps.targets.read(cotangents, lanes)
 
         def add(ids, carry):
             d_here, d_table = carry
             sources = table.gather(ids)
-            weights, minus_slopes, _ = _weigh(kernels, here, sources)
+            weights, minus_slopes, _ = _weigh(kernels, lane_points, sources)
             centers = jnp.stack(sources.centers, axis=1)
             origin = centers[:, :, :1]
-            x, p = here - origin, centers - origin
+            x, p = lane_points - origin, centers - origin
             rows, pull_rows = jax.vjp(SourceTable.rows_and_moments, sources)
             g = minus_slopes * jnp.einsum("lrs,lrp->lsp", rows, cotangent)
             # Sum over the points: the cotangents of the sources.
@@ -206,18 +206,18 @@ def _backward(residuals, cotangents):
             d_here = d_here - 2 * (x * over_sources[:, :1] - over_sources[:, 1:])
             return d_here, d_table.scatter_add(ids, d_sources)
 
-        d_here, d_table = lanes.each_row(given.lists, add, (jnp.zeros_like(here), d_table))
+        d_here, d_table = lanes.each_row(sweeps.lists, add, (jnp.zeros_like(lane_points), d_table))
         return lanes.write(d_points, d_here), d_table
 
     start = jax.tree.map(
-        lambda each: zeros_after(cotangents, each.shape, each.dtype), (points, table)
+        lambda array: zeros_after(cotangents, array.shape, array.dtype), (points, table)
     )
-    return given.sweep(sweep, points, start)
+    return sweeps.sweep(sweep, points, start)
 
 
 _sums = jax.custom_vjp(_forward)
 _sums.defvjp(
-    lambda *given: (_forward(*given), given),
+    lambda *arguments: (_forward(*arguments), arguments),
     lambda residuals, cotangents: (None, *_backward(residuals, cotangents)),
 )
 
@@ -240,7 +240,7 @@ def gaussian_sums(
     - `targets`: the points of the sums.
     - `forward_mode`: differentiable only in forward mode, otherwise only in reverse mode. Static.
     """
-    given = _Sweep(kernels, lists, targets)
+    sweeps = _Sweep(kernels, lists, targets)
     # The loops have their own derivatives in forward mode.
     sums = _forward if forward_mode else _sums
-    return sums(given, points.reshape(-1, *points.shape[2:]), table)
+    return sums(sweeps, points.reshape(-1, *points.shape[2:]), table)

@@ -49,9 +49,11 @@ class Interactions(eqx.Module):
         """Sort pairs of blocks into rows; `blocks` is the number of blocks of points."""
         rows, counts = in_rows(points, sources, blocks, _WIDTH // block, _NONE)
         lacking = with_spare(("interactions", block), len(rows), _ROWS) - len(rows)
-        own = np.pad(np.repeat(np.arange(blocks), counts), (0, lacking), constant_values=blocks)
+        row_points = np.pad(
+            np.repeat(np.arange(blocks), counts), (0, lacking), constant_values=blocks
+        )
         rows = np.pad(rows, ((0, lacking), (0, 0)), constant_values=_NONE)
-        return cls(jnp.asarray(own, jnp.int32), jnp.asarray(rows), block)
+        return cls(jnp.asarray(row_points, jnp.int32), jnp.asarray(rows), block)
 
     def reduce(
         self,
@@ -70,14 +72,14 @@ class Interactions(eqx.Module):
             leaf = leaf.reshape(-1, size).at[at].get(mode="fill", fill_value=0)
             return leaf.reshape(len(at), -1)
 
-        here = jax.tree.map(lambda leaf: read(leaf, self.points, POINTS_PER_BLOCK), points)
-        there = jax.tree.map(lambda leaf: read(leaf, self.sources, self.block), sources)
+        x = jax.tree.map(lambda leaf: read(leaf, self.points, POINTS_PER_BLOCK), points)
+        y = jax.tree.map(lambda leaf: read(leaf, self.sources, self.block), sources)
 
-        def of_rows(here, there):
-            here = jax.tree.map(lambda leaf: leaf[:, None], here)
-            return function(here, jax.tree.map(lambda leaf: leaf[:, :, None], there))
+        def of_rows(x, y):
+            x = jax.tree.map(lambda leaf: leaf[:, None], x)
+            return function(x, jax.tree.map(lambda leaf: leaf[:, :, None], y))
 
-        rows = map_chunks(of_rows, here, there, at_once=_ROWS)
+        rows = map_chunks(of_rows, x, y, at_once=_ROWS)
         return jax.tree.map(
             lambda leaf: combine(leaf, self.points, blocks, indices_are_sorted=True).reshape(-1),
             rows,
@@ -124,22 +126,24 @@ class Hierarchy(eqx.Module):
         radii = [0.5 * np.linalg.norm(np.maximum(high - low, 0), axis=1) for low, high in boxes]
         begins = np.cumsum([0, *map(len, radii[:-1])])
         low_x, high_x = _boxes(centers, exists, POINTS_PER_BLOCK)
-        some, coarsest = np.flatnonzero(low_x[:, 0] <= high_x[:, 0]), len(radii[-1])
-        own, other = np.repeat(some, coarsest), np.tile(np.arange(coarsest), len(some))
+        occupied, coarsest = np.flatnonzero(low_x[:, 0] <= high_x[:, 0]), len(radii[-1])
+        targets = np.repeat(occupied, coarsest)
+        sources = np.tile(np.arange(coarsest), len(occupied))
         far = []
         for level in reversed(range(len(boxes))):
             low, high = boxes[level]
-            keep = low[other, 0] <= high[other, 0]
-            own, other = own[keep], other[keep]
-            gap = np.maximum(low[other] - high_x[own], low_x[own] - high[other])
+            keep = low[sources, 0] <= high[sources, 0]
+            targets, sources = targets[keep], sources[keep]
+            gap = np.maximum(low[sources] - high_x[targets], low_x[targets] - high[sources])
             squared = np.sum(np.square(np.maximum(gap, 0)), axis=1)
-            is_far = (radii[level][other] ** 2 < opening**2 * squared) & (squared > least**2)
-            far.append((own[is_far], begins[level] + other[is_far]))
-            own, other = own[~is_far], other[~is_far]
+            is_far = (radii[level][sources] ** 2 < opening**2 * squared) & (squared > least**2)
+            far.append((targets[is_far], begins[level] + sources[is_far]))
+            targets, sources = targets[~is_far], sources[~is_far]
             if level:
-                own, other = np.repeat(own, 2), (2 * other[:, None] + np.arange(2)).reshape(-1)
-        near = Interactions.of(own, other, len(low_x), SOURCES_PER_BLOCK)
-        pairs = (np.concatenate(each) for each in zip(*far, strict=True))
+                targets = np.repeat(targets, 2)
+                sources = (2 * sources[:, None] + np.arange(2)).reshape(-1)
+        near = Interactions.of(targets, sources, len(low_x), SOURCES_PER_BLOCK)
+        pairs = (np.concatenate(levels) for levels in zip(*far, strict=True))
         return cls(near, Interactions.of(*pairs, len(low_x), 1))
 
 

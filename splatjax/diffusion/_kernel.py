@@ -117,7 +117,7 @@ class AbstractDiffusionKernel(eqx.Module):
     def interval(self, unevenness: Float[Array, ""]) -> Float[Array, "2"]:
         """Compute the standard deviations per spacing between which layers become resolved."""
         regular, scattered = (
-            jnp.asarray(each, unevenness.dtype) for each in (self.regular, self.scattered)
+            jnp.asarray(end, unevenness.dtype) for end in (self.regular, self.scattered)
         )
         return regular + jnp.clip(unevenness / _UNEVEN, 0, 1) * (scattered - regular)
 

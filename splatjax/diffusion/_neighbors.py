@@ -57,8 +57,8 @@ class Lists(eqx.Module):
         def step(i, out):
             of_lanes = jax.lax.dynamic_slice_in_dim(order, i * lanes, lanes)
             first, counts = (
-                each.at[of_lanes].get(mode="fill", fill_value=0)
-                for each in (self.first, self.counts)
+                table.at[of_lanes].get(mode="fill", fill_value=0)
+                for table in (self.first, self.counts)
             )
             return sweep(Lanes(of_lanes, first, counts), out)
 
@@ -163,33 +163,34 @@ def find_neighbors(
     """
     low, high = sources.corners
     corners = (np.split(corner, parts) for corner in points.corners)
-    own = [np.flatnonzero(np.asarray(layers) == layer) for layer in range(len(reaches))]
+    layers = np.asarray(layers)
     blocks = len(points.low) // parts
     lists = blocks * len(reaches)  # of a part
 
     def search(part: Corners, layer: int) -> Pairs:
         """Find the pairs of a list of a part and a block of sources."""
-        of, near = pairs_in_reach(part, (low[own[layer]], high[own[layer]]), reaches[layer])
-        return layer * blocks + of, own[layer][near]
+        of_layer = np.flatnonzero(layers == layer)
+        targets, near = pairs_in_reach(part, (low[of_layer], high[of_layer]), reaches[layer])
+        return layer * blocks + targets, of_layer[near]
 
-    found = []
+    tables = []
     # Only NumPy computes in the threads, since JAX's precision may be set for one thread.
     with ThreadPoolExecutor() as pool:
         for part in zip(*corners, strict=True):
             pairs = pool.map(partial(search, part), range(len(reaches)))
-            of, near = (np.concatenate(each) for each in zip(*pairs, strict=True))
-            rows, counts = in_rows(of, near, lists, BLOCKS_PER_ROW, len(low))
+            targets, near = (np.concatenate(column) for column in zip(*pairs, strict=True))
+            rows, counts = in_rows(targets, near, lists, BLOCKS_PER_ROW, len(low))
             order = np.argsort(-counts, kind="stable")
-            found.append((rows, np.cumsum(counts) - counts, counts, order))
+            tables.append((rows, np.cumsum(counts) - counts, counts, order))
     # At least one row, the last, stays empty: lanes whose list has ended read it.
-    most = max(len(rows) for rows, *_ in found)
+    most = max(len(rows) for rows, *_ in tables)
     count = max(least, _ROWS * lists, with_spare(("rows", lists), most, 1, per_octave=2))
     padded = [
-        (np.pad(rows, ((0, count - len(rows)), (0, 0)), constant_values=len(low)), *each)
-        for rows, *each in found
+        (np.pad(rows, ((0, count - len(rows)), (0, 0)), constant_values=len(low)), *columns)
+        for rows, *columns in tables
     ]
-    whole = (np.concatenate(each) for each in zip(*padded, strict=True))
-    return Lists(*(jnp.asarray(each, jnp.int32) for each in whole))
+    joined = (np.concatenate(column) for column in zip(*padded, strict=True))
+    return Lists(*(jnp.asarray(table, jnp.int32) for table in joined))
 
 
 def in_rows(
@@ -206,7 +207,7 @@ def in_rows(
     targets, sources = targets[order], sources[order]
     lengths = np.bincount(targets, minlength=count)
     counts = -(-lengths // width)
-    first, begins = (np.cumsum(each) - each for each in (counts, lengths))
+    first, begins = (np.cumsum(number) - number for number in (counts, lengths))
     rows = np.full((counts.sum(), width), empty, np.int32)
     rows.reshape(-1)[(first * width - begins)[targets] + np.arange(len(targets))] = sources
     return rows, counts
@@ -235,14 +236,14 @@ def pairs_in_reach(points: Corners, sources: Corners, reach: float) -> Pairs:
     if not reach:
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     depth = math.ceil(math.log(max(len(points[0]), len(sources[0]), 2), _FAN))
-    each = zip(_levels(points, depth), _levels(sources, depth), strict=True)
-    levels = [(*of_points, *of_sources) for of_points, of_sources in each]
+    both_levels = zip(_levels(points, depth), _levels(sources, depth), strict=True)
+    levels = [(*of_points, *of_sources) for of_points, of_sources in both_levels]
     root, none = np.zeros(1, np.int32), np.zeros(0, np.int32)
-    todo, found = [(depth - 1, root, root)], [(none, none)]
+    todo, in_reach = [(depth - 1, root, root)], [(none, none)]
     while todo:
-        level, own, other = todo.pop()
-        for begin in range(0, len(own), _AT_ONCE):
-            a, b = own[begin : begin + _AT_ONCE], other[begin : begin + _AT_ONCE]
+        level, target_boxes, source_boxes = todo.pop()
+        for begin in range(0, len(target_boxes), _AT_ONCE):
+            a, b = target_boxes[begin : begin + _AT_ONCE], source_boxes[begin : begin + _AT_ONCE]
             gaps = (
                 np.maximum(
                     low_a[a][:, :, None] - high_b[b][:, None],
@@ -254,8 +255,8 @@ def pairs_in_reach(points: Corners, sources: Corners, reach: float) -> Pairs:
             pair, part, other_part = np.nonzero(squared <= reach * reach)
             pairs = a[pair] * _FAN + part, b[pair] * _FAN + other_part
             if level == 0:
-                found.append(pairs)
+                in_reach.append(pairs)
             else:
                 todo.append((level - 1, *pairs))
-    own, other = (np.concatenate(each) for each in zip(*found, strict=True))
-    return own, other
+    targets, near = (np.concatenate(column) for column in zip(*in_reach, strict=True))
+    return targets, near

@@ -183,8 +183,8 @@ class LayersAtPoints(eqx.Module):
         - `single_scattering_albedo`: the fraction that leaves a flat surface as single scattering.
         """
         weights, variances = gaussians.weights[:, :, None], self.variances[:, None, None]
-        given = weights, variances, single_scattering_albedo, self.means, self.mass[:, None]
-        layers, resolved = self._weigh(*given)
+        inputs = weights, variances, single_scattering_albedo, self.means, self.mass[:, None]
+        layers, resolved = self._weigh(*inputs)
         return layers, resolved[:, 0]
 
     def linear_in_means(
@@ -195,10 +195,10 @@ class LayersAtPoints(eqx.Module):
         **Arguments:** as for `weigh`.
         """
         weights, variances = gaussians.weights[:, :, None], self.variances[:, None, None]
-        given = weights, variances, single_scattering_albedo, self.mass[:, None]
-        gain, resolved, own = self._gain(*given)
+        inputs = weights, variances, single_scattering_albedo, self.mass[:, None]
+        gain, resolved, local = self._gain(*inputs)
         gain = weights * gain
-        return jnp.sum(gain * (1 - resolved) * own, axis=0), gain * resolved
+        return jnp.sum(gain * (1 - resolved) * local, axis=0), gain * resolved
 
     def _gain(self, weights, variances, single_scattering_albedo, mass):
         """Compute the factor of each layer, the fraction that is the diffusion integral, and the
@@ -206,10 +206,10 @@ class LayersAtPoints(eqx.Module):
         """
         resolved = resolved_fraction(variances, self.area[None, None], self.interval)
         resolved = jnp.where(mass > 0, resolved, 0.0)
-        own, root = self.irradiance[None], 1.0
+        local, root = self.irradiance[None], 1.0
         if self.factors is not None:
             root = albedo_root(self.factors)
-            own, weights = own * root, weights * root**2
+            local, weights = local * root, weights * root**2
         # Splats that do not resolve a layer do not determine its mass either.
         gain = self.kernel.gain(
             1 + resolved * (mass - 1),
@@ -217,11 +217,11 @@ class LayersAtPoints(eqx.Module):
             weights * self.albedo[None],
             single_scattering_albedo[:, None] * self.albedo,
         )
-        return root * gain, resolved, own
+        return root * gain, resolved, local
 
     def _weigh(self, weights, variances, single_scattering_albedo, means, mass):
-        gain, resolved, own = self._gain(weights, variances, single_scattering_albedo, mass)
-        return gain * (own + resolved * (means - own)), resolved
+        gain, resolved, local = self._gain(weights, variances, single_scattering_albedo, mass)
+        return gain * (local + resolved * (means - local)), resolved
 
     def exitance(self, gaussians: SumOfGaussians) -> Float[Array, "channels points"]:
         """Compute the radiant exitance `sum_k w_k L_k` of a material without single scattering.
@@ -236,12 +236,12 @@ class LayersAtPoints(eqx.Module):
         return self._exitance(weights, variances, jnp.zeros_like(weights[0, :, 0]))
 
     def _exitance(self, weights, variances, single_scattering_albedo):
-        own = self.variances[:, None, None]
+        planned = self.variances[:, None, None]
         means, mass = self.means, self.mass[:, None]
         if self.derivative is None:
-            variances = own
+            variances = planned
         else:
-            moved = jnp.log(variances / own)
+            moved = jnp.log(variances / planned)
             means = means + moved * self.derivative[0]
             mass = jnp.maximum(mass + moved * self.derivative[1][:, None], 0)
         layers, _ = self._weigh(weights, variances, single_scattering_albedo, means, mass)
@@ -260,11 +260,11 @@ class LayersAtPoints(eqx.Module):
         if self.derivative is None:
             raise ValueError("derivative is None; compute the layers with derivative=True")
         # Points and channels are independent, so one derivative gives those of all.
-        own = gaussians.weights[:, :, None], gaussians.variances[:, None, None]
-        own = tuple(jnp.broadcast_to(each, self.means.shape) for each in own)
+        inputs = gaussians.weights[:, :, None], gaussians.variances[:, None, None]
+        inputs = tuple(jnp.broadcast_to(array, self.means.shape) for array in inputs)
 
         def exitance(weights, variances):
             return self._exitance(weights, variances, single_scattering_albedo)
 
-        total, pull = jax.vjp(exitance, *own)
+        total, pull = jax.vjp(exitance, *inputs)
         return pull(jnp.ones_like(total))

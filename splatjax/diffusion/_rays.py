@@ -90,11 +90,11 @@ def scattered_once(
     shares, left = (
         jnp.asarray(x, beams.irradiance.dtype)[:, None] for x in (nodes[1] * left, left**2)
     )
-    centers, normals = (jnp.stack(each) for each in (surface.centers, surface.normals))
+    centers, normals = (jnp.stack(planes) for planes in (surface.centers, surface.normals))
 
-    def of_channel(given):
-        medium, kappa, irradiance, directions = given
-        own = ScreenedKernel(kappa[None], kernel.length)
+    def of_channel(channel):
+        medium, kappa, irradiance, directions = channel
+        channel_kernel = ScreenedKernel(kappa[None], kernel.length)
 
         def exits(row):
             rows = [row, *surface.normals]
@@ -118,16 +118,16 @@ def scattered_once(
         early = _leaves_early(depth, medium)
         early_beyond = jnp.where(is_through, (1 - bend) * _leaves_early(beyond, medium), 0.0)
         leaving = jnp.sum(early * scattered, axis=0)
-        (there,) = to_exits(surface.areas * jnp.sum(early_beyond * scattered, axis=0))
-        leaving = leaving + there / jnp.where(surface.areas > 0, surface.areas, 1.0)
+        (emerging,) = to_exits(surface.areas * jnp.sum(early_beyond * scattered, axis=0))
+        leaving = leaving + emerging / jnp.where(surface.areas > 0, surface.areas, 1.0)
         diffuses = (1 - early - early_beyond) * scattered * medium.lasting
         # The others see the plane of beams below each splat.
-        unseen = own.plane_integral(depth[None])[0]
+        unseen = channel_kernel.plane_integral(depth[None])[0]
 
         def add(total, plane):
             charges, along = plane
             places = tuple(centers + along[None] * directions)
-            return total + surface.potential(own, surface.areas * charges, places), None
+            return total + surface.potential(channel_kernel, surface.areas * charges, places), None
 
         total, _ = jax.lax.scan(
             jax.checkpoint(add), jnp.sum(diffuses * unseen, axis=0), (diffuses, along)
@@ -221,7 +221,7 @@ class SolvedLight(eqx.Module):
         direction = jnp.mean(directions, axis=0)
         light = SurfaceLight(fluence, flux, beams.irradiance, entering, direction)
         far, _, thickness = light.at_exits(surface, tuple(-normals))
-        nodes, weights = (each.tolist() for each in np.polynomial.legendre.leggauss(_COSINES))
+        nodes, weights = (column.tolist() for column in np.polynomial.legendre.leggauss(_COSINES))
         mean = jnp.zeros_like(exitance)
         for node, weight in zip(nodes, weights, strict=True):
             cosine = (node + 1) / 2

@@ -103,8 +103,8 @@ class ShapeDiffuser(AbstractDiffuser):
         source, leaving = scattered_once(surface, coefficients, finer, beams)
 
         exists = (surface.areas > 0)[None]
-        one, z_e = jnp.ones_like(surface.areas)[None], coefficients.z_e
-        share = -surface.layers(ScreenedKernel(jnp.zeros(1, z_e.dtype), kernel.length), [0.0], one)
+        ones, z_e = jnp.ones_like(surface.areas)[None], coefficients.z_e
+        share = -surface.layers(ScreenedKernel(jnp.zeros(1, z_e.dtype), kernel.length), [0.0], ones)
         # The part that softening removes uses phi of its own splat.
         unseen = kernel.plane_integral(jnp.zeros_like(z_e)[:, None])
         diagonal = jnp.where(exists, share + unseen / z_e[:, None], 1.0)
@@ -133,7 +133,8 @@ class ShapeDiffuser(AbstractDiffuser):
         point inward.
         """
         centers, normals, areas = (
-            np.asarray(each, np.float64) for each in (splats.centers, splats.normals, splats.areas)
+            np.asarray(field, np.float64)
+            for field in (splats.centers, splats.normals, splats.areas)
         )
         area = areas.sum()
         if not area > 0:
@@ -194,8 +195,9 @@ class ShapePlan(AbstractDiffusionPlan):
 
     def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
         surface, entering = SurfaceSums.of(splats, self.hierarchy), beams()
-        given = splats, material.medium, entering, self.hierarchy, bounced
-        exitance = self.diffuser.radiant_exitance(*given)
+        exitance = self.diffuser.radiant_exitance(
+            splats, material.medium, entering, self.hierarchy, bounced
+        )
         padded = surface.padded((exitance, entering, bounced))
         solved = SolvedLight.of(surface, material, *padded)
         at = jnp.arange(splats.count) if at is None else at

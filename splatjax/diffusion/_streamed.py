@@ -92,7 +92,7 @@ class StreamedDiffusion:
     def _sum_part(self, sources: Sources) -> Float[Array, "layers values points"]:
         order = compact_order(np.asarray(sources.centers.T))
         sources = jax.tree.map(lambda rows: rows[..., order], sources.of_layers(self.gaussians))
-        arrays = (np.asarray(each.T) for each in (sources.centers, sources.normals))
+        arrays = (np.asarray(rows.T) for rows in (sources.centers, sources.normals))
         exists = np.asarray(sources.areas) > 0
         clusters = LayerSources.build(*arrays, exists, self.edges, self.source_capacity)
         self.source_capacity = max(self.source_capacity, clusters.count)

@@ -184,8 +184,8 @@ class SurfaceSums(eqx.Module):
             )
             for (charge, power), total in zip(channels, totals, strict=True)
         ]
-        given = (powers, facing, self.centers), (totals, dipoles, centers, moments)
-        return jnp.stack(self.hierarchy.sum(near, far, self.centers, *given))
+        inputs = (powers, facing, self.centers), (totals, dipoles, centers, moments)
+        return jnp.stack(self.hierarchy.sum(near, far, self.centers, *inputs))
 
     def potential(
         self, kernel: ScreenedKernel, charges: Float[Array, " splats"], places: Planes
@@ -262,12 +262,12 @@ class SurfaceSums(eqx.Module):
         means = [cluster_totals(self.areas * row) / jnp.where(total > 0, total, 1) for row in rows]
         rays, (near, far) = (self.centers, directions), (self.hierarchy.near, self.hierarchy.far)
         starting = (
-            each.reduce(first, rays, given, jax.ops.segment_min)
-            for each, given in zip((near, far), discs, strict=True)
+            interactions.reduce(first, rays, sources, jax.ops.segment_min)
+            for interactions, sources in zip((near, far), discs, strict=True)
         )
         start = jax.lax.stop_gradient(jnp.minimum(*starting))
-        given = zip(discs, (list(rows), means), strict=True)
-        weight, *sums = self.hierarchy.sum(blend, blend, (*rays, start), *given)
+        sources = zip(discs, (list(rows), means), strict=True)
+        weight, *sums = self.hierarchy.sum(blend, blend, (*rays, start), *sources)
         is_hit = starts & (weight > 0)
         length, cosine, *read = (row / jnp.where(is_hit, weight, 1.0) for row in sums)
         length = jnp.where(is_hit, length, jnp.where(starts, jnp.inf, 0.0))
@@ -277,8 +277,8 @@ class SurfaceSums(eqx.Module):
         """Fit the slopes of rows along the surface, 1/mm, over about two spacings."""
         spread = jnp.sum(self.areas**2) / jnp.sum(self.areas)
 
-        def moments(here, there):
-            (x, normals), (y, facing, areas, rows) = here, there
+        def moments(target, source):
+            (x, normals), (y, facing, areas, rows) = target, source
             offset = _offset(x, y)
             squared = dot(offset, offset)
             cosine = jnp.maximum(dot(normals, facing), 0)
@@ -291,9 +291,9 @@ class SurfaceSums(eqx.Module):
             products = [[total(axis * row) for axis in offset] for row in rows]
             return *sums, [total(row) for row in rows], products
 
-        given = self.centers, self.normals, self.areas, jnp.unstack(rows)
+        sources = self.centers, self.normals, self.areas, jnp.unstack(rows)
         total, center, squared, means, products = self.hierarchy.near.reduce(
-            moments, (self.centers, self.normals), given
+            moments, (self.centers, self.normals), sources
         )
         inverse = 1 / jnp.where(total > 0, total, 1.0)
         # Twice the variance along the surface.
@@ -306,7 +306,7 @@ class SurfaceSums(eqx.Module):
 
 def _offset(x, y):
     """Compute the components of `y - x` of all pairs, each a plane."""
-    return [there - here for here, there in zip(x, y, strict=True)]
+    return [b - a for a, b in zip(x, y, strict=True)]
 
 
 def _second_moments(moments, offset):
@@ -317,6 +317,6 @@ def _second_moments(moments, offset):
     return xx + yy + zz, along
 
 
-def dot(one, other):
+def dot(a, b):
     """Multiply vectors whose components are planes."""
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

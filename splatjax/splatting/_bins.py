@@ -33,7 +33,7 @@ class BinCapacity(eqx.Module):
         cls, per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid, spare: float = 1.03
     ) -> "BinCapacity":
         """Choose the capacity for each of these numbers of items per tile."""
-        pairs, blocks, chunks, whole = 1, 1, 1, grid.padded_count // grid.lanes
+        pairs, blocks, chunks, all_chunks = 1, 1, 1, grid.padded_count // grid.lanes
         for tiles in per_tile:
             counts = np.asarray(tiles, np.int64)
             # Blocks of the longest list of each chunk: the lists of a chunk take as many each.
@@ -44,14 +44,14 @@ class BinCapacity(eqx.Module):
         return cls(
             with_spare(("pairs", grid), pairs, _ROW, per_octave=4, spare=spare),
             with_spare(("blocks", grid), blocks, 4, per_octave=2, spare=spare),
-            min(max(chunks, grid.half), whole),
+            min(max(chunks, grid.half), all_chunks),
         )
 
     def coarse(self, grid: TileGrid) -> "BinCapacity":
         """Round up to the next powers of two, and to all chunks."""
-        whole = grid.padded_count // grid.lanes
-        pairs, blocks = (1 << each.bit_length() for each in (self.pairs, self.blocks))
-        return BinCapacity(pairs, blocks, whole)
+        all_chunks = grid.padded_count // grid.lanes
+        pairs, blocks = (1 << count.bit_length() for count in (self.pairs, self.blocks))
+        return BinCapacity(pairs, blocks, all_chunks)
 
 
 class Bins(eqx.Module):

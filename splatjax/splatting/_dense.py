@@ -80,13 +80,13 @@ class DenseRasterPlan(AbstractRasterPlan):
             # Behind it, in pixels that it leaves open: the same among all others, from the nearest
             # that weighs something.
             is_open = jax.lax.stop_gradient(in_front[-1]) < settings.full_coverage
-            rest = inside & ~front & is_open[:, None]
-            weighty = nearest(rest & (weight > least[None]))
-            limit = jnp.where(weighty > -jnp.inf, weighty, nearest(rest))
-            return in_front, summed(rest & (nearness > limit[:, None]))
+            behind = inside & ~front & is_open[:, None]
+            weighty = nearest(behind & (weight > least[None]))
+            limit = jnp.where(weighty > -jnp.inf, weighty, nearest(behind))
+            return in_front, summed(behind & (nearness > limit[:, None]))
 
-        both = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
-        rows = jnp.concatenate([grid.cut(surface.transpose(1, 0, 2)) for surface in both])
+        surfaces = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
+        rows = jnp.concatenate([grid.cut(surface.transpose(1, 0, 2)) for surface in surfaces])
         tiles = jnp.tile(jnp.arange(grid.count, dtype=jnp.int32), 2)
         sums = PixelSums(rows[:, :-1], rows[:, -1])
         return FragmentSums(tiles, sums, jnp.zeros((), dtype), grid.count)

@@ -105,8 +105,8 @@ class Sweep(eqx.Module):
 
     def splats(self, planes, block, lanes: Lanes):
         """Read a block's splats, `[lanes, slots]` each, placed relative to their tile's corner."""
-        x, y, *rest = (lanes.read(plane, block) for plane in planes)
-        return x - lanes.x, y - lanes.y, *rest
+        x, y, *fields = (lanes.read(plane, block) for plane in planes)
+        return x - lanes.x, y - lanes.y, *fields
 
     def fragments(self, splats):
         """Compute nearness and quadric of a block's fragments, `[lanes, slots, pixels]`."""
@@ -145,7 +145,7 @@ class Sweep(eqx.Module):
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
             least = least_weight(self.view_class, *splats[4:8], self.filter_radius)
             chosen = weight > least[:, :, None], squared_radius < 1
-            new = (jnp.max(jnp.where(which, shifted, -jnp.inf), axis=1) for which in chosen)
+            new = (jnp.max(jnp.where(is_chosen, shifted, -jnp.inf), axis=1) for is_chosen in chosen)
             return tuple(jnp.maximum(*pair) for pair in zip(limits, new, strict=True))
 
         return lax.fori_loop(

@@ -52,12 +52,12 @@ class TileGrid(eqx.Module):
     def cut(self, picture: Float[Array, "rows height width"]) -> Float[Array, "tiles rows pixels"]:
         """Divide a picture into tiles; 0 beyond its edges."""
         rows, height, width = picture.shape
-        whole = jnp.pad(
+        padded = jnp.pad(
             picture,
             ((0, 0), (0, self.down * TILE_SIDE - height), (0, self.across * TILE_SIDE - width)),
         )
         return (
-            whole.reshape(rows, self.down, TILE_SIDE, self.across, TILE_SIDE)
+            padded.reshape(rows, self.down, TILE_SIDE, self.across, TILE_SIDE)
             .transpose(1, 3, 0, 2, 4)
             .reshape(self.count, rows, TILE_SIDE**2)
         )
@@ -65,10 +65,10 @@ class TileGrid(eqx.Module):
     def join(self, tiles: Float[Array, "tiles rows pixels"]) -> Float[Array, "rows height width"]:
         """Join the tiles of a picture."""
         rows = tiles.shape[1]
-        whole = tiles.reshape(self.down, self.across, rows, TILE_SIDE, TILE_SIDE).transpose(
+        padded = tiles.reshape(self.down, self.across, rows, TILE_SIDE, TILE_SIDE).transpose(
             2, 0, 3, 1, 4
         )
-        return whole.reshape(rows, self.down * TILE_SIDE, self.across * TILE_SIDE)[
+        return padded.reshape(rows, self.down * TILE_SIDE, self.across * TILE_SIDE)[
             :, : self.height, : self.width
         ]
 
@@ -122,7 +122,7 @@ class TileRanges(eqx.Module):
 
     def per_tile(self, grid: TileGrid) -> Int[Array, " tiles"]:
         """Count the items of every tile, from the corners of their rectangles."""
-        one = jnp.where(self.across * self.down > 0, 1, 0)
+        touched = jnp.where(self.across * self.down > 0, 1, 0)
         corners = jnp.zeros((grid.down + 1, grid.across + 1), jnp.int32)
         i0, j0 = jnp.minimum(self.left, grid.across), jnp.minimum(self.top, grid.down)
         i1, j1 = (
@@ -131,13 +131,13 @@ class TileRanges(eqx.Module):
         )
         corners = (
             corners.at[j0, i0]
-            .add(one)
+            .add(touched)
             .at[j1, i1]
-            .add(one)
+            .add(touched)
             .at[j0, i1]
-            .add(-one)
+            .add(-touched)
             .at[j1, i0]
-            .add(-one)
+            .add(-touched)
         )
         counts = jnp.cumsum(jnp.cumsum(corners, axis=0), axis=1)[:-1, :-1].reshape(-1)
         return jnp.pad(counts, (0, grid.padded_count - counts.shape[0]))

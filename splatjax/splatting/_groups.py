@@ -138,11 +138,11 @@ class Sightlines(eqx.Module):
         count = settings.directions
         lines = even_directions(count)[: count // 2]
         seen = np.full((count, len(exists)), len(exists), np.int32)
-        which = np.append(np.flatnonzero(exists), len(exists))
+        numbers = np.append(np.flatnonzero(exists), len(exists))
         for i, line in enumerate(lines):
             ends = _ends(line, centers - centers.mean(axis=0), normals, spacing)
             for j, seen_along in zip((i, i + count // 2), ends, strict=True):
-                seen[j, which[:-1]] = which[seen_along]
+                seen[j, numbers[:-1]] = numbers[seen_along]
         directions = np.concatenate([lines, -lines]).astype(centers.dtype)
         return cls(jnp.asarray(directions), jnp.asarray(seen.T), size)
 

@@ -270,7 +270,7 @@ def _compared(
     """Compare with depth and coverage of both surfaces of a map."""
     x, y, depth, slope_x, slope_y, reach = landed
     half = (settings.compared - 1) / 2
-    column, row = (jnp.floor(jax.lax.stop_gradient(each) - half) for each in (x, y))
+    column, row = (jnp.floor(jax.lax.stop_gradient(coordinate) - half) for coordinate in (x, y))
     # Pixels around each splat, side by side: [across, down, splats].
     step = jnp.arange(settings.compared, dtype=jnp.int32)[:, None]
     at_x, at_y = (
@@ -284,10 +284,10 @@ def _compared(
     middle = step.astype(x.dtype) + 0.5
     away_x, away_y = (column - x)[None] + middle, (row - y)[None] + middle
     across, down = (slope_x[None] * away_x)[:, None], (slope_y[None] * away_y)[None]
-    here = depth[None, None] + across + down
+    expected = depth[None, None] + across + down
 
     def hidden(map_depth, map_coverage):
-        beyond = (here - map_depth) / reach[None, None]
+        beyond = (expected - map_depth) / reach[None, None]
         return map_coverage * smooth_step(beyond - settings.bias, 0, settings.softness)
 
     front_depth, front_coverage, behind_depth, behind_coverage = jnp.unstack(

@@ -111,8 +111,8 @@ def _sum_bwd(sweep: Sweep, capacity: SurfaceCapacity, combination, residuals, co
 
     of_planes = tuple(zeros_after(cotangent, part.slots.shift.shape, dtype) for _ in planes)
     gradients = of_planes, zeros_after(cotangent, attributes.shape, dtype)
-    given = spans.far_limit, spans.near_limit, cotangent
-    of_planes, of_rows = part.each_round(spans.tiles, given, add, gradients)
+    rows = spans.far_limit, spans.near_limit, cotangent
+    of_planes, of_rows = part.each_round(spans.tiles, rows, add, gradients)
     of_splats = (scatter_slots(slots, bins, shift.shape[0]) for slots in of_planes)
     return None, None, tuple(of_splats), of_rows
 
@@ -147,9 +147,9 @@ class PartSweep(eqx.Module):
     def empty_sums(self, front: Spans, capacity: SurfaceCapacity) -> PixelSums:
         """Return sums over no fragments, for the places of both surfaces."""
         places, attributes = capacity.front + capacity.behind, self.slots.attributes
-        known, dtype = (front.far_limit, attributes), front.far_limit.dtype
-        rows = zeros_after(known, (places, attributes.shape[1] + 1, TILE_SIDE**2), dtype)
-        return PixelSums(rows, zeros_after(known, (places, TILE_SIDE**2), dtype))
+        inputs, dtype = (front.far_limit, attributes), front.far_limit.dtype
+        rows = zeros_after(inputs, (places, attributes.shape[1] + 1, TILE_SIDE**2), dtype)
+        return PixelSums(rows, zeros_after(inputs, (places, TILE_SIDE**2), dtype))
 
     @jit_unless_traced
     def add_sums(self, spans: Spans, so_far: PixelSums, first: int) -> PixelSums:
@@ -162,8 +162,8 @@ class PartSweep(eqx.Module):
             before = _sliced(so_far, first + i, len(tiles))
             return _write(so_far, jax.tree.map(jnp.add, before, sums), first + i)
 
-        given = spans.far_limit, spans.near_limit, spans.tiles
-        return self.each_round(spans.tiles, given, add, so_far)
+        rows = spans.far_limit, spans.near_limit, spans.tiles
+        return self.each_round(spans.tiles, rows, add, so_far)
 
     @jit_unless_traced
     def limits_behind(
@@ -179,8 +179,8 @@ class PartSweep(eqx.Module):
         none = zeros_after(open_limit, open_limit.shape, open_limit.dtype) - jnp.inf
         return self.each_round(tiles, (open_limit,), look, (none, none))
 
-    def each_round(self, tiles: Int[Array, " places"], given, function: Callable, out):
-        """Apply `function(first place, lanes, *given, out)` to the places, as many at a time as
+    def each_round(self, tiles: Int[Array, " places"], rows, function: Callable, out):
+        """Apply `function(first place, lanes, *rows, out)` to the places, as many at a time as
         there are lanes, up to the last tile.
         """
         grid, bins, dtype = self.sweep.grid, self.bins, self.slots.shift.dtype
@@ -192,7 +192,7 @@ class PartSweep(eqx.Module):
 
         def step(i, out):
             first = i * grid.lanes
-            lane_numbers, *arguments = _sliced((of_place, *given), first, grid.lanes)
+            lane_numbers, *arguments = _sliced((of_place, *rows), first, grid.lanes)
             return function(first, self.sweep.lanes(bins, lane_numbers, dtype), *arguments, out)
 
         ends = jnp.arange(1, len(tiles) + 1, dtype=jnp.int32)
@@ -262,17 +262,17 @@ def _listed(chosen: Bool[Array, " all"], size: int) -> Int[Array, " size"]:
     return jnp.nonzero(chosen, size=size, fill_value=len(chosen))[0].astype(jnp.int32)
 
 
-def _taken(whole: Array, places: Int[Array, " places"], fill) -> Array:
-    return whole.at[places].get(mode="fill", fill_value=fill)
+def _taken(array: Array, places: Int[Array, " places"], fill) -> Array:
+    return array.at[places].get(mode="fill", fill_value=fill)
 
 
-def _sliced(whole, place, size: int):
+def _sliced(arrays, place, size: int):
     """Read so many rows from a place on."""
-    return jax.tree.map(lambda rows: jax.lax.dynamic_slice_in_dim(rows, place, size), whole)
+    return jax.tree.map(lambda rows: jax.lax.dynamic_slice_in_dim(rows, place, size), arrays)
 
 
 def _write(out, parts, place):
     """Write parts from a place on."""
     return jax.tree.map(
-        lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, place, 0), out, parts
+        lambda array, part: jax.lax.dynamic_update_slice_in_dim(array, part, place, 0), out, parts
     )

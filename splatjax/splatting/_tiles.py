@@ -109,17 +109,17 @@ class TilePlan(AbstractRasterPlan):
     def fitted(
         self, parts: Sequence[Splats], views: Sequence[AbstractView], settings: SplattingSettings
     ) -> "TilePlan":
-        whole, plan = parts[0], self
+        joined, plan = parts[0], self
         if len(parts) > 1:
-            whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-            plan = self.rasterizer.make_plan([whole], views, settings)
+            joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+            plan = self.rasterizer.make_plan([joined], views, settings)
         # Coarse capacities, so that other bodies and pictures of the size share the program.
         grid = self.rasterizer.grid(views[0])
         bins = plan.bins.coarse(grid)
         front = bins.chunks * grid.lanes
-        seen = min(1 << plan.splats.bit_length(), whole.count)
+        seen = min(1 << plan.splats.bit_length(), joined.count)
         coarse = TilePlan(self.rasterizer, seen, bins, SurfaceCapacity(front, front))
-        most = max(int(_tiles_behind(whole, view, settings, coarse)) for view in views)
+        most = max(int(_tiles_behind(joined, view, settings, coarse)) for view in views)
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
         capacity = -(-int(_SPARE * most + 1) // grain) * grain
