@@ -1,6 +1,7 @@
 """Sums over all splats of a body at every splat: near ones one by one, far ones in clusters."""
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -20,8 +21,6 @@ _AXES = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # of second moments
 _WIDTH = 128  # sources in a row
 _ROWS = 16  # at once
 _NONE = np.iinfo(np.int32).max // 2  # beyond all blocks
-
-Planes = tuple[Float[Array, "_"], Float[Array, "_"], Float[Array, "_"]]
 
 
 class Interactions(eqx.Module):
@@ -61,29 +60,37 @@ class Interactions(eqx.Module):
         points: PyTree[Array],
         sources: PyTree[Array],
         combine: Callable = jax.ops.segment_sum,
-    ) -> PyTree[Array]:
-        """Apply a function to points `[rows, 1, points]` and sources `[rows, sources, 1]`, and
-        combine its results for each row, `[rows, points]`. Absent sources are 0.
+    ) -> Float[Array, "results points"]:
+        """Apply a function to points `[..., rows, 1, points]` and sources `[..., rows, sources,
+        1]`, and combine each of its results, `[rows, points]`. Absent sources are 0.
         """
-        blocks = jax.tree.leaves(points)[0].shape[0] // POINTS_PER_BLOCK
-
+        blocks = jax.tree.leaves(points)[0].shape[-1] // POINTS_PER_BLOCK
         # Read before the loop, so that the derivative adds to the sources once.
-        def read(leaf, at, size):
-            leaf = leaf.reshape(-1, size).at[at].get(mode="fill", fill_value=0)
-            return leaf.reshape(len(at), -1)
-
-        x = jax.tree.map(lambda leaf: read(leaf, self.points, POINTS_PER_BLOCK), points)
-        y = jax.tree.map(lambda leaf: read(leaf, self.sources, self.block), sources)
+        x = jax.tree.map(lambda leaf: _read(leaf, self.points[:, None], POINTS_PER_BLOCK), points)
+        y = jax.tree.map(lambda leaf: _read(leaf, self.sources, self.block), sources)
 
         def of_rows(x, y):
-            x = jax.tree.map(lambda leaf: leaf[:, None], x)
-            return function(x, jax.tree.map(lambda leaf: leaf[:, :, None], y))
+            x = jax.tree.map(partial(_like, axis=-2), x, points)
+            return jnp.stack(function(x, jax.tree.map(partial(_like, axis=-1), y, sources)), axis=1)
 
         rows = map_chunks(of_rows, x, y, at_once=_ROWS)
-        return jax.tree.map(
-            lambda leaf: combine(leaf, self.points, blocks, indices_are_sorted=True).reshape(-1),
-            rows,
-        )
+        combined = combine(rows, self.points, blocks, indices_are_sorted=True)
+        return jnp.swapaxes(combined, 0, 1).reshape(combined.shape[1], -1)
+
+
+def _read(
+    leaf: Float[Array, "*planes elements"], at: Int[Array, "rows blocks"], size: int
+) -> Float[Array, "rows planes row_elements"]:
+    """Read blocks of elements in rows."""
+    blocks = leaf.reshape(-1, leaf.shape[-1] // size, size).swapaxes(0, 1)
+    rows = blocks.at[at].get(mode="fill", fill_value=0).swapaxes(1, 2)
+    return rows.reshape(len(at), blocks.shape[1], -1)
+
+
+def _like(rows: Float[Array, "rows planes row_elements"], leaf: Array, axis: int):
+    """Return rows that were read from a leaf, `[*planes, rows, elements]`, with a new axis."""
+    planes = rows.swapaxes(0, 1).reshape(*leaf.shape[:-1], len(rows), -1)
+    return jnp.expand_dims(planes, axis)
 
 
 class Hierarchy(eqx.Module):
@@ -99,10 +106,9 @@ class Hierarchy(eqx.Module):
         points: PyTree[Array],
         splats: PyTree[Array],
         clusters: PyTree[Array],
-    ) -> PyTree[Array]:
+    ) -> Float[Array, "results points"]:
         """Sum `near` over near splats and `far` over clusters, as `Interactions.reduce`."""
-        sums = self.near.reduce(near, points, splats), self.far.reduce(far, points, clusters)
-        return jax.tree.map(jnp.add, *sums)
+        return self.near.reduce(near, points, splats) + self.far.reduce(far, points, clusters)
 
     @classmethod
     def build(
@@ -152,29 +158,50 @@ def padded_count(count: int) -> int:
     return -(-count // SIZES[-1]) * SIZES[-1]
 
 
-def cluster_totals(plane: Float[Array, " splats"]) -> Float[Array, " clusters"]:
+def cluster_totals(rows: Float[Array, "*rows splats"]) -> Float[Array, "*rows clusters"]:
     """Sum over the clusters of every level except the first."""
-    return jnp.concatenate([jnp.sum(plane.reshape(-1, size), axis=1) for size in SIZES[1:]])
+    levels, width = [], SIZES[1]
+    for _ in SIZES[1:]:
+        rows = jnp.sum(rows.reshape(*rows.shape[:-1], -1, width), axis=-1)
+        levels.append(rows)
+        width = 2
+    return jnp.concatenate(levels, axis=-1)
 
 
-def clusters(
-    centers: Planes, weights: Float[Array, " splats"]
-) -> tuple[Planes, list[Float[Array, " clusters"]]]:
-    """Compute weighted centers of the clusters of all levels, and half their second moments."""
+class Clusters(eqx.Module):
+    """The clusters of every level except the first.
 
-    def of_level(size):
-        mass = weights.reshape(-1, size)
-        total = jnp.sum(mass, axis=1, keepdims=True)
-        mass = mass / jnp.where(total > 0, total, 1.0)
-        members = [axis.reshape(-1, size) for axis in centers]
-        means = [jnp.sum(mass * axis, axis=1) for axis in members]
-        offsets = [axis - mean[:, None] for axis, mean in zip(members, means, strict=True)]
-        return means, [0.5 * jnp.sum(mass * offsets[i] * offsets[j], axis=1) for i, j in _AXES]
+    **Attributes:**
 
-    means, moments = jax.tree.map(
-        lambda *levels: jnp.concatenate(levels), *map(of_level, SIZES[1:])
-    )
-    return tuple(means), moments
+    - `totals`: of the weights.
+    - `centers`: weighted.
+    - `moments`: half the second moments xx, yy, zz, xy, xz, yz about the center, over the totals.
+    """
+
+    totals: Float[Array, " clusters"]
+    centers: Float[Array, "3 clusters"]
+    moments: Float[Array, "6 clusters"]
+
+    @classmethod
+    def of(cls, centers: Float[Array, "3 splats"], weights: Float[Array, " splats"]) -> "Clusters":
+        """Merge splats to the first clusters, and those of each level to the next."""
+        levels = [cls(weights, centers, jnp.zeros((len(_AXES), len(weights)), weights.dtype))]
+        for width in (SIZES[1], *[2] * (len(SIZES) - 2)):
+            levels.append(levels[-1]._merged(width))
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), *levels[1:])
+
+    def _merged(self, width: int) -> "Clusters":
+        """Merge runs of `width` clusters."""
+        weights, centers, moments = jax.tree.map(
+            lambda leaf: leaf.reshape(*leaf.shape[:-1], -1, width),
+            (self.totals, self.centers, self.moments),
+        )
+        totals = jnp.sum(weights, axis=-1)
+        shares = weights / jnp.where(totals > 0, totals, 1.0)[:, None]
+        means = jnp.sum(shares[None] * centers, axis=-1)
+        offsets = centers - means[..., None]
+        products = jnp.stack([0.5 * offsets[i] * offsets[j] for i, j in _AXES])
+        return Clusters(totals, means, jnp.sum(shares[None] * (moments + products), axis=-1))
 
 
 def _boxes(centers, exists, size):

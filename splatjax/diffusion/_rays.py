@@ -12,7 +12,6 @@ from splatjax.scattering import ExactFresnel, Medium
 from splatjax.scene import Material
 
 from ._diffuser import Beams
-from ._hierarchy import Planes
 from ._surface_sums import GRAZING, ScreenedKernel, SurfaceSums, dot
 
 _DEPTHS = 6  # along each beam
@@ -90,16 +89,16 @@ def scattered_once(
     shares, left = (
         jnp.asarray(x, beams.irradiance.dtype)[:, None] for x in (nodes[1] * left, left**2)
     )
-    centers, normals = (jnp.stack(planes) for planes in (surface.centers, surface.normals))
+    centers, normals = surface.centers, surface.normals
 
     def of_channel(channel):
         medium, kappa, irradiance, directions = channel
         channel_kernel = ScreenedKernel(kappa[None], kernel.length)
 
         def exits(row):
-            rows = [row, *surface.normals]
-            length, cosine, rows = surface.first_exits(tuple(directions), irradiance > 0, rows)
-            return rows[0], (length, cosine, dot(rows[1:], surface.normals))
+            rows = jnp.concatenate([row[None], normals])
+            length, cosine, rows = surface.first_exits(directions, irradiance > 0, rows)
+            return rows[0], (length, cosine, dot(rows[1:], normals))
 
         none = jnp.zeros_like(irradiance)
         _, to_exits, ends = jax.vjp(exits, none, has_aux=True)
@@ -126,7 +125,7 @@ def scattered_once(
 
         def add(total, plane):
             charges, along = plane
-            places = tuple(centers + along[None] * directions)
+            places = centers + along[None] * directions
             return total + surface.potential(channel_kernel, surface.areas * charges, places), None
 
         total, _ = jax.lax.scan(
@@ -169,15 +168,15 @@ class SurfaceLight(eqx.Module):
     entering: Float[Array, "channels splats"]
     direction: Float[Array, "3 splats"]
 
-    def at_exits(self, surface: SurfaceSums, way: Planes):
+    def at_exits(self, surface: SurfaceSums, way: Float[Array, "3 splats"]):
         """Follow rays into the body: return the light at their ends, none where they do not end,
         the cosine of the exit, and the length of the ray, mm, finite for its derivative.
         """
         parts = jax.tree.leaves(self)
-        rows = list(jnp.concatenate(parts))
+        rows = jnp.concatenate(parts)
         length, cosine, rows = surface.first_exits(way, surface.areas > 0, rows)
         ends = jnp.isfinite(length)
-        rows = jnp.where(ends, jnp.stack(rows), 0.0)
+        rows = jnp.where(ends[None], rows, 0.0)
         light = SurfaceLight(*jnp.split(rows, np.cumsum([len(part) for part in parts])[:-1]))
         return light, jnp.where(ends, cosine, 1.0), jnp.where(ends, length, _ENDLESS)
 
@@ -212,7 +211,7 @@ class SolvedLight(eqx.Module):
         **Arguments:** as for `AbstractDiffusionPlan.light`, padded.
         """
         coefficients = DiffusionCoefficients.of(material.medium)
-        normals, directions = jnp.stack(surface.normals), beams.directions
+        normals, directions = surface.normals, beams.directions
         fluence = flux = exitance
         if bounced is not None:
             balance = coefficients.diffusion_coefficient / coefficients.z_e * coefficients.inward
@@ -220,14 +219,17 @@ class SolvedLight(eqx.Module):
         entering = jnp.maximum(-jnp.sum(directions * normals[None], axis=1), 0)
         direction = jnp.mean(directions, axis=0)
         light = SurfaceLight(fluence, flux, beams.irradiance, entering, direction)
-        far, _, thickness = light.at_exits(surface, tuple(-normals))
-        nodes, weights = (column.tolist() for column in np.polynomial.legendre.leggauss(_COSINES))
-        mean = jnp.zeros_like(exitance)
-        for node, weight in zip(nodes, weights, strict=True):
-            cosine = (node + 1) / 2
+        far, _, thickness = light.at_exits(surface, -normals)
+        rule = np.stack(np.polynomial.legendre.leggauss(_COSINES), axis=1)
+
+        def add(mean, node_and_weight):
+            cosine, weight = (node_and_weight[0] + 1) / 2, node_and_weight[1]
             mu = _inside(jnp.full_like(thickness, cosine), material.eta)
             seen = source_integral(light, far, mu, mu, thickness / mu, coefficients)
-            mean = mean + weight * cosine * seen
+            return mean + weight * cosine * seen, None
+
+        start, rule = jnp.zeros_like(exitance), jnp.asarray(rule, exitance.dtype)
+        mean, _ = jax.lax.scan(jax.checkpoint(add), start, rule)
         return cls(exitance, surface.slopes(exitance), light, mean)
 
 
@@ -247,20 +249,20 @@ def radiance_towards(
         surface.normals,
         material.eta,
     )
-    to_eye = [e - c for e, c in zip(eye, surface.centers, strict=True)]
+    to_eye = eye[:, None] - surface.centers
     # Padding is at the origin, where an eye may be.
     squared = jnp.where(surface.areas > 0, dot(to_eye, to_eye), 1.0)
-    to_eye = [axis / jnp.sqrt(squared) for axis in to_eye]
+    to_eye = to_eye / jnp.sqrt(squared)[None]
     cosine = jnp.maximum(dot(to_eye, normals), GRAZING)
-    along = [(e - cosine * n) / eta for e, n in zip(to_eye, normals, strict=True)]
+    along = (to_eye - cosine[None] * normals) / eta
     mu = _inside(cosine, eta)
-    way = tuple(-(a + mu * n) for a, n in zip(along, normals, strict=True))
+    way = -(along + mu[None] * normals)
     far, far_mu, length = light.surface.at_exits(surface, way)
     seen = source_integral(light.surface, far, mu, far_mu, length, coefficients)
     shape = seen / jnp.where(light.mean > 0, light.mean, 1.0)
     shape = jnp.where(light.mean > 0, jnp.clip(shape, 0, _BRIGHTEST), 1.0)
     optical = jnp.minimum(length[None] * coefficients.sigma_t[:, None], _LONGEST)
-    slope = jnp.sum(light.slopes * jnp.stack(along)[None], axis=1)
+    slope = jnp.sum(light.slopes * along[None], axis=1)
     spread = 4 * coefficients.diffusion_coefficient * coefficients.sigma_t
     depth = (coefficients.albedo * coefficients.z_e / spread)[:, None]
     sideways = depth * slope * (1 - (1 + optical) * jnp.exp(-optical))

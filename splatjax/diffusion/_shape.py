@@ -92,7 +92,12 @@ class ShapeDiffuser(AbstractDiffuser):
         - `bounced`: irradiance of uniform light that enters beside the beams.
         """
         surface = SurfaceSums.of(splats, hierarchy)
-        beams, bounced = surface.padded((beams, bounced))
+        return self.exitance_on_surface(surface, medium, *surface.padded((beams, bounced)))[
+            :, : splats.count
+        ]
+
+    def exitance_on_surface(self, surface: SurfaceSums, medium, beams, bounced):
+        """Compute `radiant_exitance` of padded splats."""
         coefficients, area = DiffusionCoefficients.of(medium), jnp.sum(surface.areas)
         spread = jnp.sqrt(jnp.sum(surface.areas**2) / area)
         # A medium without absorption is the limit of a small kappa: the square of this fraction is
@@ -104,22 +109,23 @@ class ShapeDiffuser(AbstractDiffuser):
 
         exists = (surface.areas > 0)[None]
         ones, z_e = jnp.ones_like(surface.areas)[None], coefficients.z_e
-        share = -surface.layers(ScreenedKernel(jnp.zeros(1, z_e.dtype), kernel.length), [0.0], ones)
+        zero = jnp.zeros(1, z_e.dtype)
+        share = -surface.layers(ScreenedKernel(zero, kernel.length), zero, ones)
         # The part that softening removes uses phi of its own splat.
         unseen = kernel.plane_integral(jnp.zeros_like(z_e)[:, None])
         diagonal = jnp.where(exists, share + unseen / z_e[:, None], 1.0)
 
         def product(phi):
-            return phi + surface.layers(kernel, list(1 / z_e), phi) / diagonal
+            return phi + surface.layers(kernel, 1 / z_e, phi) / diagonal
 
         flux = (coefficients.diffusion_coefficient / z_e)[:, None]
         if bounced is not None:
             leaving = leaving + (1 - flux * coefficients.inward[:, None]) * bounced
             inward = (coefficients.inward / z_e)[:, None] * bounced
-            single_layer = surface.layers(kernel, [1.0] * len(z_e), inward, dipole=0.0)
+            single_layer = surface.layers(kernel, jnp.ones_like(z_e), inward, dipole=0.0)
             source = source + single_layer + unseen * inward
         right = jnp.where(exists, source / diagonal, 0.0)
-        return (flux * solve(product, right, self.error) + leaving)[:, : splats.count]
+        return flux * solve(product, right, self.error) + leaving
 
     def find_hierarchy(self, splats: Splats) -> Hierarchy:
         """Check that the splats bound a body, and choose near splats and clusters. Not for traced
@@ -194,12 +200,10 @@ class ShapePlan(AbstractDiffusionPlan):
         return dataclasses.replace(shown, medium=material.medium)
 
     def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
-        surface, entering = SurfaceSums.of(splats, self.hierarchy), beams()
-        exitance = self.diffuser.radiant_exitance(
-            splats, material.medium, entering, self.hierarchy, bounced
-        )
-        padded = surface.padded((exitance, entering, bounced))
-        solved = SolvedLight.of(surface, material, *padded)
+        surface = SurfaceSums.of(splats, self.hierarchy)
+        padded = surface.padded((beams(), bounced))
+        exitance = self.diffuser.exitance_on_surface(surface, material.medium, *padded)
+        solved = SolvedLight.of(surface, material, exitance, *padded)
         at = jnp.arange(splats.count) if at is None else at
         layers = LayerValues(*(take_points(row[None], at) for row in (exitance, solved.slopes)))
         return Diffused(layers, jnp.zeros_like(exitance[0, 0])), solved

@@ -3,7 +3,6 @@ the Green's function of the diffusion equation, softened within their spacing.
 """
 
 import math
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -13,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from splatjax.scene import Splats
 
-from ._hierarchy import Hierarchy, Planes, cluster_totals, clusters, padded_count
+from ._hierarchy import Clusters, Hierarchy, cluster_totals, padded_count
 
 GRAZING = 1e-3  # cosine
 _OVERLAP = 1.5  # radius of a splat over the root of its area
@@ -94,25 +93,35 @@ class ScreenedKernel(eqx.Module):
 
         - `height`: of the point over the plane, mm.
         """
-        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+        rule = np.stack(np.polynomial.legendre.leggauss(_NODES), axis=1)
         kappa = self.kappa.reshape(-1, *[1] * (height.ndim - 1))
-        end, total = _REACH * self.length, jnp.zeros_like(height)
+        end = _REACH * self.length
         span = jnp.maximum(end - jnp.abs(height), 0)
-        for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
+
+        def add(total, node_and_weight):
+            node, weight = node_and_weight
             r = end - span * (1 - node) / 2
             inverse, _ = self._softening(r * r)
             left_out = jnp.exp(-kappa * r) - r * inverse * jnp.exp(-kappa / inverse)
-            total = total + weight / 4 * span * left_out
-        return total
+            return total + weight / 4 * span * left_out, None
+
+        start, rule = jnp.zeros_like(height), jnp.asarray(rule, height.dtype)
+        return jax.lax.scan(jax.checkpoint(add), start, rule)[0]
 
 
 class SurfaceSums(eqx.Module):
-    """The splats of a body as planes, padded, and their near splats and clusters."""
+    """The splats of a body as planes, padded, and their near splats and clusters.
+
+    **Attributes:**
+
+    - `clusters`: weighted by area.
+    """
 
     hierarchy: Hierarchy
-    centers: Planes
-    normals: Planes
+    centers: Float[Array, "3 splats"]
+    normals: Float[Array, "3 splats"]
     areas: Float[Array, " splats"]
+    clusters: Clusters
 
     @classmethod
     def of(cls, splats: Splats, hierarchy: Hierarchy) -> "SurfaceSums":
@@ -122,10 +131,10 @@ class SurfaceSums(eqx.Module):
                 "weights=None, or render with ClusterDiffuser"
             )
         more = padded_count(splats.count) - splats.count
-        centers, normals = (
-            tuple(jnp.pad(rows, ((0, more), (0, 0))).T) for rows in (splats.centers, splats.normals)
-        )
-        return cls(hierarchy, centers, normals, jnp.pad(splats.areas, (0, more)))
+        rows = splats.centers.T, splats.normals.T
+        centers, normals = (jnp.pad(row, ((0, 0), (0, more))) for row in rows)
+        areas = jnp.pad(splats.areas, (0, more))
+        return cls(hierarchy, centers, normals, areas, Clusters.of(centers, areas))
 
     def padded(self, rows: PyTree[Array]) -> PyTree[Array]:
         """Append zeros to rows along the splats, for the padding."""
@@ -139,15 +148,14 @@ class SurfaceSums(eqx.Module):
     def layers(
         self,
         kernel: ScreenedKernel,
-        charges: Sequence[Float[Array, ""] | float],
+        charges: Float[Array, " channels"],
         strengths: Float[Array, "channels splats"],
         dipole: float = 1.0,
     ) -> Float[Array, "channels splats"]:
         """Compute `int (c G + d dG/dn_y) f dA`, of every channel with its own c, 1/mm, and d the
         strength of the dipole.
         """
-        facing = tuple(dipole * axis for axis in self.normals)
-        powers = jnp.unstack(self.areas[None] * strengths)
+        facing, powers = dipole * self.normals, self.areas[None] * strengths
 
         def near(x, sources):
             strengths, normals, y = sources
@@ -174,21 +182,20 @@ class SurfaceSums(eqx.Module):
                 )
             ]
 
-        centers, moments = clusters(self.centers, self.areas)
-        channels = list(zip(charges, powers, strict=True))
-        totals = [charge * cluster_totals(power) for charge, power in channels]
-        dipoles = [
-            tuple(
-                cluster_totals(power * (charge * x + n)) - total * center
-                for x, n, center in zip(self.centers, facing, centers, strict=True)
-            )
-            for (charge, power), total in zip(channels, totals, strict=True)
-        ]
+        centers, moments = self.clusters.centers, self.clusters.moments
+        totals = charges[:, None] * cluster_totals(powers)
+        about_origin = powers[:, None] * (
+            charges[:, None, None] * self.centers[None] + facing[None]
+        )
+        dipoles = cluster_totals(about_origin) - totals[:, None] * centers[None]
         inputs = (powers, facing, self.centers), (totals, dipoles, centers, moments)
-        return jnp.stack(self.hierarchy.sum(near, far, self.centers, *inputs))
+        return self.hierarchy.sum(near, far, self.centers, *inputs)
 
     def potential(
-        self, kernel: ScreenedKernel, charges: Float[Array, " splats"], places: Planes
+        self,
+        kernel: ScreenedKernel,
+        charges: Float[Array, " splats"],
+        places: Float[Array, "3 splats"],
     ) -> Float[Array, " splats"]:
         """Compute `sum_j q_j G` of charges below the splats, for a kernel of one channel, 1/mm.
 
@@ -201,26 +208,25 @@ class SurfaceSums(eqx.Module):
             charges, y = sources
             offset = _offset(x, y)
             ((value, _),) = kernel.near(dot(offset, offset))
-            return jnp.sum(charges * value, axis=1)
+            return [jnp.sum(charges * value, axis=1)]
 
-        def far(x, sources):
-            totals, y, moments = sources
-            offset = _offset(x, y)
-            trace, along = _second_moments(moments, offset)
+        def far(x, clusters):
+            offset = _offset(x, clusters.centers)
+            trace, along = _second_moments(clusters.moments, offset)
             # In thin parts light scatters nearer to the far side than its splats are: the trace,
             # added to the squared distance, keeps sums finite and positive.
             ((value, _, twice),) = kernel.far(dot(offset, offset) + 2 * trace)
-            return jnp.sum(totals * (value + along * twice), axis=1)
+            return [jnp.sum(clusters.totals * (value + along * twice), axis=1)]
 
-        merged = cluster_totals(charges), *clusters(places, charges)
-        return self.hierarchy.sum(near, far, self.centers, (charges, places), merged)
+        merged = Clusters.of(places, charges)
+        return self.hierarchy.sum(near, far, self.centers, (charges, places), merged)[0]
 
     def first_exits(
         self,
-        directions: Planes,
+        directions: Float[Array, "3 splats"],
         starts: Bool[Array, " splats"],
-        rows: Sequence[Float[Array, " splats"]] = (),
-    ) -> tuple[Float[Array, " splats"], Float[Array, " splats"], list[Float[Array, " splats"]]]:
+        rows: Float[Array, "rows splats"],
+    ) -> tuple[Float[Array, " splats"], Float[Array, " splats"], Float[Array, "rows splats"]]:
         """Follow a ray from each splat to its exit from the body. The choice of the exit splat is
         discontinuous.
 
@@ -246,7 +252,7 @@ class SurfaceSums(eqx.Module):
 
         def first(ray, discs):
             is_hit, t, *_ = crossing(ray, discs)
-            return jnp.min(jnp.where(is_hit, t, jnp.inf), axis=1)
+            return [jnp.min(jnp.where(is_hit, t, jnp.inf), axis=1)]
 
         def blend(ray, discs):
             ray, first, (discs, rows) = ray[:2], ray[2], discs
@@ -255,23 +261,21 @@ class SurfaceSums(eqx.Module):
             weight = jnp.where(is_near, jnp.exp(-6 * jnp.where(is_near, missed, 0.0)), 0.0)
             return [jnp.sum(weight * row, axis=1) for row in (1.0, t, cosine, *rows)]
 
-        facing = tuple(self.areas * axis for axis in self.normals)
-        centers, _ = clusters(self.centers, self.areas)
-        discs = (self.centers, facing), (centers, tuple(map(cluster_totals, facing)))
-        total = cluster_totals(self.areas)
-        means = [cluster_totals(self.areas * row) / jnp.where(total > 0, total, 1) for row in rows]
+        facing, total = self.areas[None] * self.normals, self.clusters.totals
+        discs = (self.centers, facing), (self.clusters.centers, cluster_totals(facing))
+        means = cluster_totals(self.areas[None] * rows) / jnp.where(total > 0, total, 1.0)[None]
         rays, (near, far) = (self.centers, directions), (self.hierarchy.near, self.hierarchy.far)
-        starting = (
+        starts_of = (
             interactions.reduce(first, rays, sources, jax.ops.segment_min)
             for interactions, sources in zip((near, far), discs, strict=True)
         )
-        start = jax.lax.stop_gradient(jnp.minimum(*starting))
-        sources = zip(discs, (list(rows), means), strict=True)
-        weight, *sums = self.hierarchy.sum(blend, blend, (*rays, start), *sources)
-        is_hit = starts & (weight > 0)
-        length, cosine, *read = (row / jnp.where(is_hit, weight, 1.0) for row in sums)
-        length = jnp.where(is_hit, length, jnp.where(starts, jnp.inf, 0.0))
-        return length, cosine, read
+        (start,) = jax.lax.stop_gradient(jnp.minimum(*starts_of))
+        sources = zip(discs, (rows, means), strict=True)
+        sums = self.hierarchy.sum(blend, blend, (*rays, start), *sources)
+        is_hit = starts & (sums[0] > 0)
+        means = sums[1:] / jnp.where(is_hit, sums[0], 1.0)[None]
+        length = jnp.where(is_hit, means[0], jnp.where(starts, jnp.inf, 0.0))
+        return length, means[1], means[2:]
 
     def slopes(self, rows: Float[Array, "rows splats"]) -> Float[Array, "rows 3 splats"]:
         """Fit the slopes of rows along the surface, 1/mm, over about two spacings."""
@@ -287,21 +291,21 @@ class SurfaceSums(eqx.Module):
             def total(plane):
                 return jnp.sum(weight * plane, axis=1)
 
-            sums = jnp.sum(weight, axis=1), [total(axis) for axis in offset], total(squared)
-            products = [[total(axis * row) for axis in offset] for row in rows]
-            return *sums, [total(row) for row in rows], products
+            rows = list(rows)
+            products = [axis * row for row in rows for axis in offset]
+            return [jnp.sum(weight, axis=1), *map(total, (squared, *offset, *rows, *products))]
 
-        sources = self.centers, self.normals, self.areas, jnp.unstack(rows)
-        total, center, squared, means, products = self.hierarchy.near.reduce(
-            moments, (self.centers, self.normals), sources
-        )
+        sources = self.centers, self.normals, self.areas, rows
+        sums = self.hierarchy.near.reduce(moments, (self.centers, self.normals), sources)
+        total, squared, center = sums[0], sums[1], sums[2:5]
+        means, products = sums[5 : 5 + len(rows)], sums[5 + len(rows) :].reshape(len(rows), 3, -1)
         inverse = 1 / jnp.where(total > 0, total, 1.0)
         # Twice the variance along the surface.
         variance = squared - dot(center, center) * inverse
         scale = jnp.where(variance > 0, 2 / jnp.where(variance > 0, variance, 1.0), 0.0)
-        means, products, center, normals = map(jnp.asarray, (means, products, center, self.normals))
-        slopes = scale * (products - center[None] * (means * inverse)[:, None])
-        return slopes - jnp.sum(slopes * normals[None], axis=1, keepdims=True) * normals[None]
+        slopes = scale[None, None] * (products - center[None] * (means * inverse[None])[:, None])
+        normals = self.normals[None]
+        return slopes - jnp.sum(slopes * normals, axis=1, keepdims=True) * normals
 
 
 def _offset(x, y):
@@ -319,4 +323,5 @@ def _second_moments(moments, offset):
 
 def dot(a, b):
     """Multiply vectors whose components are planes."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    (a_x, a_y, a_z), (b_x, b_y, b_z) = a, b
+    return a_x * b_x + a_y * b_y + a_z * b_z

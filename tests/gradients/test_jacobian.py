@@ -2,6 +2,7 @@
 derivative behind it. How derivatives compose with `jit`, `vmap` and `lax.map`.
 """
 
+import dataclasses
 from functools import cache
 
 import bodies
@@ -117,6 +118,7 @@ def graph(path: str):
     other = sj.Camera.look_at(
         jnp.asarray([2.0, -4.0, 41.0]), jnp.zeros(3), fov=32.0, width=20, height=20
     )
+    other = dataclasses.replace(other, principal_point=[0.5, 0.5])  # the same leaves
     plan = sj.make_plan(world.scene, [world.camera, other], settings)
 
     def parts(scene):
