@@ -24,6 +24,7 @@ from ._search import (
     SharedVariances as SharedVariances,
     VariancesPerChannel as VariancesPerChannel,
 )
+from ._table import weight_table as weight_table, WeightTable as WeightTable
 from ._weights import (
     AbstractWeights as AbstractWeights,
     FixedTotalReflectance as FixedTotalReflectance,

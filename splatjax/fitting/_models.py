@@ -97,7 +97,7 @@ class TransportModel(AbstractModel):
 
 
 def weight_factors(
-    gaussians: SumOfGaussians, other: SumOfGaussians
+    gaussians: SumOfGaussians, other: AbstractProfile
 ) -> Float[Array, "gaussians channels"]:
     """Fit the factors on the weights of Gaussians that make another profile of them, of its total
     reflectance: `Splats.weights` where the body is of the other material. Not for traced arrays.
@@ -105,13 +105,21 @@ def weight_factors(
     A Gaussian without weight in a channel keeps none: the material with the wider profile should be
     the first.
     """
-    weights, rule = np.asarray(gaussians.weights), TransportModel.rule
-    held, factors = NonNegativeWeights(FixedTotalReflectance()), np.ones_like(weights)
-    for channel, used in enumerate((weights > 0).T):
-        profile = SumOfGaussians(other.variances, other.weights[:, channel, None])
-        fitted = fit_weights(profile, gaussians.variances[used], weights=held, rule=rule).weights
-        factors[used, channel] = fitted[:, 0] / weights[used, channel]
+    weights = np.asarray(gaussians.weights)
+    factors, has_weight = np.ones_like(weights), weights > 0
+    for used in np.unique(has_weight, axis=1).T:
+        alike = np.ix_(used, np.all(has_weight == used[:, None], axis=0))
+        fitted = np.ones_like(weights)
+        fitted[used] = _fit_held(other, gaussians.variances[used])
+        factors[alike] = fitted[alike] / weights[alike]
     return jnp.asarray(factors)
+
+
+@eqx.filter_jit
+def _fit_held(profile: AbstractProfile, variances: Float[Array, " gaussians"]):
+    """Fit weights that are not negative, of the profile's total reflectance."""
+    held = NonNegativeWeights(FixedTotalReflectance())
+    return fit_weights(profile, variances, weights=held, rule=TransportModel.rule).weights
 
 
 class MediumFit(eqx.Module):

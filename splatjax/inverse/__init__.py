@@ -1,5 +1,8 @@
-"""Optical coefficients from pictures, with error bars; also albedo, lights, cameras and shape."""
+"""Optical coefficients from pictures, with error bars; also maps of a material's parameters,
+albedo, lights, cameras and shape.
+"""
 
+from ._draws import randomized_fits as randomized_fits
 from ._fit_scene import (
     fit_scene as fit_scene,
     FittedScene as FittedScene,
@@ -19,13 +22,14 @@ from ._observation import (
     default_candidates as default_candidates,
     Observation as Observation,
 )
+from ._offsets import NormalOffsets as NormalOffsets
+from ._parameter_map import ParameterMap as ParameterMap
 from ._parts import (
     AbstractPart as AbstractPart,
     AlbedoMap as AlbedoMap,
     CameraPoses as CameraPoses,
     LightPlaces as LightPlaces,
     LightStrengths as LightStrengths,
-    NormalOffsets as NormalOffsets,
 )
 from ._problem import wide_variances as wide_variances
 from ._recover import (

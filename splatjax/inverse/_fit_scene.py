@@ -15,6 +15,7 @@ from splatjax._records import as_floats
 from splatjax.render import Plan, RenderSettings, render
 from splatjax.scene import AbstractLight, Camera, Material, Splats
 
+from ._movable_scene import Coordinates, MovableScene
 from ._observation import (
     AbstractBackground,
     AbstractLoss,
@@ -30,60 +31,6 @@ from ._observation import (
 )
 from ._parts import AbstractPart
 from ._problem import make_plans
-
-# Coordinates of each part; a tuple with those of each picture if pictures do not share the part.
-Coordinates = tuple[PyTree[Array], ...]
-
-
-class MovableScene(eqx.Module):
-    """The material, and the parts of the scene that may move."""
-
-    material: Material
-    parts: tuple[AbstractPart, ...]
-    prepared: tuple[PyTree[Array], ...]
-
-    @classmethod
-    def of(
-        cls, splats: Splats, material: Material, parts: Sequence[AbstractPart]
-    ) -> "MovableScene":
-        return cls(material, tuple(parts), tuple(part.prepared(splats) for part in parts))
-
-    def start(self, pictured_scenes: Sequence[PicturedScene]) -> Coordinates:
-        """Return the coordinates of the start: zeros."""
-        return tuple(
-            part.coordinates(pictured_scenes[0])
-            if part.shared
-            else tuple(part.coordinates(pictured) for pictured in pictured_scenes)
-            for part in self.parts
-        )
-
-    def of_picture(self, x: Coordinates, number: int) -> Coordinates:
-        """Select the coordinates that a picture depends on."""
-        return tuple(
-            coordinates if part.shared else coordinates[number]
-            for part, coordinates in zip(self.parts, x, strict=True)
-        )
-
-    def of_all(self, pictures: Sequence[Coordinates]) -> Coordinates:
-        """Combine derivatives in the coordinates of each picture: add those of shared parts."""
-        return tuple(
-            jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *derivatives)
-            if part.shared
-            else derivatives
-            for part, derivatives in zip(self.parts, zip(*pictures, strict=True), strict=True)
-        )
-
-    def moved(self, pictured: PicturedScene, x: Coordinates) -> PicturedScene:
-        for part, coordinates, prepared in zip(self.parts, x, self.prepared, strict=True):
-            pictured = part.moved(pictured, coordinates, prepared)
-        return pictured
-
-    def prior(self, x: Coordinates) -> Float[Array, ""] | float:
-        return sum(
-            part.prior(group, prepared)
-            for part, coordinates, prepared in zip(self.parts, x, self.prepared, strict=True)
-            for group in ((coordinates,) if part.shared else coordinates)
-        )
 
 
 class Evaluation(eqx.Module):
@@ -130,10 +77,16 @@ def advance(
     state: PyTree,
     evaluations: Sequence[Evaluation],
     scene: MovableScene,
+    expected: list[Array],
     optimizer: Any,
 ):
     """Take a step; also return the loss before it, and whether loss and gradient are finite."""
-    prior, prior_gradient = jax.value_and_grad(lambda x: jnp.asarray(scene.prior(x)))(x)
+
+    def prior_loss(x):
+        residuals = jax.tree.map(jnp.subtract, scene.prior_residuals(x), expected)
+        return jnp.asarray(sum((jnp.sum(leaf**2) for leaf in residuals), 0.0))
+
+    prior, prior_gradient = jax.value_and_grad(prior_loss)(x)
     counts = [
         jnp.sum(evaluation.counted) * evaluation.beauty.shape[2] for evaluation in evaluations
     ]
@@ -147,6 +100,23 @@ def advance(
     return jax.tree.map(jnp.add, x, updates), state, loss, jnp.all(finite)
 
 
+class FitState(eqx.Module):
+    """The state of a fit after its last step.
+
+    **Attributes:**
+
+    - `x`: the coordinates of the next step.
+    - `optimizer`: its state; `None` to start again.
+    - `plans`: of the pictures.
+    - `expected`: means of the residuals of the priors; zeros but in `randomized_fits`.
+    """
+
+    x: Coordinates
+    optimizer: PyTree
+    plans: list[Plan]
+    expected: list[Array]
+
+
 class FittedScene(eqx.Module):
     r"""The best scene of a fit.
 
@@ -155,6 +125,7 @@ class FittedScene(eqx.Module):
     - `splats`: the body.
     - `cameras`, `lights`: of each picture.
     - `material`: the given one.
+    - `maps`: of `ParameterMap`: the values of each parameter, by name.
     - `losses`: at the start and after each step: the sum of the losses of all pixels and of the
       priors, over the number of values that count. About 1 if the residual is noise.
     - `best`: the step with the least loss, to which the other fields belong. Static.
@@ -162,16 +133,20 @@ class FittedScene(eqx.Module):
     - `pictures`: rendered; NaN where a pixel does not count.
     - `residuals`: rendered less observed pictures.
     - `result`: the outcome, as a message (`optimistix.RESULTS`).
+    - `coordinates`: of the parts; `state`: of the fit, from which it continues (`start`).
     """
 
     splats: Splats
     cameras: tuple[Camera, ...]
     lights: tuple[tuple[AbstractLight, ...], ...]
     material: Material
+    maps: dict[str, Float[Array, " splats"]]
     losses: Float[np.ndarray, " steps"]
     pictures: tuple[Float[np.ndarray, "_ _ channels"], ...]
     residuals: tuple[Float[np.ndarray, "_ _ channels"], ...]
     result: optx.RESULTS
+    coordinates: Coordinates
+    state: FitState
     best: int = eqx.field(static=True)
     plans: int = eqx.field(static=True)
 
@@ -187,6 +162,7 @@ def fit_scene(
     loss: AbstractLoss = SquaredLoss(),
     background: AbstractBackground = UnknownBackground(),
     settings: RenderSettings = RenderSettings(),
+    start: FittedScene | None = None,
     progress: Callable[[str, float], None] | None = None,
     throw: bool = True,
 ) -> FittedScene:
@@ -206,7 +182,7 @@ def fit_scene(
       their cameras and lights, which are otherwise assumed right. Without a deviation, the noise is
       1% of the root mean square of the picture.
     - `splats`: the body, mm; `AlbedoMap` and `NormalOffsets` start from it.
-    - `material`: known. `recover` finds coefficients.
+    - `material`: known, with the Gaussians of a `ParameterMap`. `recover` finds coefficients.
     - `parts`: the parts that may change, each kind once.
     - `optimizer`: any of optax whose update needs only gradients. Its rate is in steps:
       `optax.adam(1.0)` first moves each coordinate by one step at a time. With a rate that decays
@@ -217,6 +193,8 @@ def fit_scene(
       `BlackBackground()` all unmasked pixels count, which determines cameras and outlines much
       better.
     - `settings`: of the renderer.
+    - `start`: a fit to continue, by `steps` more. If all other arguments are equal, the result is
+      that of one fit with all steps, bit for bit.
     - `progress`: called with a description of each stage, and the loss.
     - `throw`: raise when a loss or gradient is not finite; otherwise `result` reports it, and the
       best scene so far is returned.
@@ -238,7 +216,6 @@ def fit_scene(
     )
     scene = MovableScene.of(pictured_scenes[0].splats, material, parts)
     evidence = [Evidence.of(observation, dtype) for observation in observations]
-    x = scene.start(pictured_scenes)
 
     def moved(x: Coordinates) -> list[PicturedScene]:
         return [
@@ -252,13 +229,26 @@ def fit_scene(
             for i, inputs in enumerate(zip(pictured_scenes, evidence, plans, strict=True))
         ]
 
-    report("planning", np.nan)
-    plans, times = make_plans(moved(x), material, settings), 1
-    # Optimizers need JAX's default rules of promotion.
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        state = optimizer.init(x)
-    best, at, losses, result = None, x, [], optx.RESULTS.successful
-    for step in range(steps + 1):
+    if start is None:
+        x = scene.start(pictured_scenes)
+        report("planning", np.nan)
+        plans, times = make_plans(moved(x), material, settings), 1
+        expected, state = jax.tree.map(jnp.zeros_like, scene.prior_residuals(x)), None
+        best, at, losses, pictures, residuals = None, x, [], (), ()
+    else:
+        x, state = start.state.x, start.state.optimizer
+        plans, times, expected = start.state.plans, start.plans, start.state.expected
+        at, losses = start.coordinates, start.losses.tolist()
+        pictures, residuals = start.pictures, start.residuals
+        best = start.best if losses else None
+    if state is None:
+        # Optimizers need JAX's default rules of promotion.
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+            state = optimizer.init(x)
+    kept, result = None, optx.RESULTS.successful
+    first = len(losses)
+    last = max(first - 1, 0) + steps
+    for step in range(first, last + 1):
         evaluations = evaluate_all(x, plans)
         if max(float(evaluation.overflow) for evaluation in evaluations) > 0:
             report(
@@ -269,35 +259,39 @@ def fit_scene(
             evaluations = evaluate_all(x, plans)
         if step == 0:
             check_counted([evaluation.counted for evaluation in evaluations])
-        ahead, state, value, finite = advance(x, state, evaluations, scene, optimizer)
+        ahead, state, value, finite = advance(x, state, evaluations, scene, expected, optimizer)
         losses.append(float(value))
         if not bool(finite):
             result = optx.RESULTS.nonfinite
             break
         if best is None or losses[-1] < losses[best]:
             best, at, kept = step, x, evaluations
-        report(f"step {step} of {steps}", losses[-1])
+        report(f"step {step} of {last}", losses[-1])
         x = ahead
     if best is None:
         raise ValueError(
             "loss or gradient of the start is not finite; check for NaN in splats, lights and "
             "cameras, and for splats at a light"
         )
-    pictures, residuals = compared(
-        [evaluation.beauty for evaluation in kept],
-        [evaluation.counted for evaluation in kept],
-        evidence,
-    )
+    if kept is not None:
+        pictures, residuals = compared(
+            [evaluation.beauty for evaluation in kept],
+            [evaluation.counted for evaluation in kept],
+            evidence,
+        )
     pictured_scenes = moved(at)
     fitted = FittedScene(
         splats=pictured_scenes[0].splats,
         cameras=tuple(pictured.camera for pictured in pictured_scenes),
         lights=tuple(pictured.lights for pictured in pictured_scenes),
         material=material,
+        maps=scene.maps(at),
         losses=np.asarray(losses),
         pictures=pictures,
         residuals=residuals,
         result=result,
+        coordinates=at,
+        state=FitState(x, state, plans, expected),
         best=best,
         plans=times,
     )
@@ -312,6 +306,8 @@ def _check(
             "at least one observation, one part and one step are needed; got "
             f"{len(observations)}, {len(parts)} and {steps}"
         )
+    for part in parts:
+        part.check_material(material)
     kinds = [type(part).__name__ for part in parts]
     if len(set(kinds)) < len(kinds):
         raise ValueError(f"each kind of part may be given once; parts are {', '.join(kinds)}")

@@ -1,6 +1,4 @@
-"""Parts of a scene that may move, each in unbounded coordinates: albedo, lights, cameras, and
-offsets of splats along their normals.
-"""
+"""Parts of a scene that may move, each in unbounded coordinates: albedo, lights and cameras."""
 
 import abc
 import dataclasses
@@ -9,24 +7,16 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-import scipy  # its parts are loaded where they are used, which takes a third of a second
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from splatjax._chunking import jit_unless_traced
 from splatjax._records import check_values
-from splatjax.geometry import tangent_frames
-from splatjax.scene import AbstractLight, Splats
+from splatjax.scene import AbstractLight, Material, Splats
 
 from ._observation import PicturedScene
 
-# An albedo moves between this and one less this: at 0 and 1 themselves the logit is infinite.
-_BOUNDED = 1e-3
+# A bounded quantity starts between this and one less this: at 0 and 1 its logit is infinite.
+BOUNDED = 1e-3
 _PLACES = ("direction", "position", "origin")  # of lights
-_REACH = 2.5  # of the blur, standard deviations
-_SLOPES = 17  # splats among which slopes are measured, itself included
-_ROUNDED = 16  # neighbors at a time, so that similar bodies share a program
-_SAME_SIDE = 0.3  # least cosine between normals of splats that belong together
 
 
 class AbstractPart(eqx.Module):
@@ -48,6 +38,9 @@ class AbstractPart(eqx.Module):
                 lambda x: x > 0,
             )
 
+    def check_material(self, material: Material) -> None:
+        """Raise `ValueError` for a material that does not match the part."""
+
     def prepared(self, splats: Splats) -> PyTree[Array]:
         """Compute data that depend only on the initial splats."""
         return None
@@ -62,9 +55,19 @@ class AbstractPart(eqx.Module):
     ) -> PicturedScene:
         """Apply coordinates to the part. Differentiable."""
 
+    def prior_residuals(self, x: PyTree[Array], prepared: PyTree[Array]) -> PyTree[Array]:
+        """Divide coordinates by their expected deviations: under the prior independent, of mean 0
+        and deviation 1. `None` without a prior. Linear.
+        """
+        return None
+
     def prior(self, x: PyTree[Array], prepared: PyTree[Array]) -> Float[Array, ""] | float:
-        """Compute the loss of the prior: squares of coordinates over their expected deviations."""
-        return 0.0
+        """Compute the loss of the prior: the sum of its squared residuals."""
+        return sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(self.prior_residuals(x, prepared)))
+
+    def maps(self, x: PyTree[Array], prepared: PyTree[Array]) -> dict[str, Float[Array, " splats"]]:
+        """Compute the maps of the part, by name; none unless it has parameters of the material."""
+        return {}
 
 
 class AlbedoMap(AbstractPart):
@@ -94,12 +97,12 @@ class AlbedoMap(AbstractPart):
         return jnp.zeros_like(pictured.splats.albedo)
 
     def moved(self, pictured: PicturedScene, x, prepared) -> PicturedScene:
-        start = jnp.clip(pictured.splats.albedo, _BOUNDED, 1 - _BOUNDED)
+        start = jnp.clip(pictured.splats.albedo, BOUNDED, 1 - BOUNDED)
         albedo = jax.nn.sigmoid(jax.scipy.special.logit(start) + self.step * x)
         return eqx.tree_at(lambda s: s.splats.albedo, pictured, albedo)
 
-    def prior(self, x: Float[Array, "splats channels"], prepared: None) -> Float[Array, ""]:
-        return jnp.sum((self.step / self.deviation * x) ** 2)
+    def prior_residuals(self, x: Float[Array, "splats channels"], prepared: None):
+        return self.step / self.deviation * x
 
 
 class LightStrengths(AbstractPart):
@@ -212,115 +215,3 @@ def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     squared, identity = vector @ vector, jnp.eye(3, dtype=vector.dtype)
     cross = jnp.cross(identity, vector[None])
     return identity + sinc(squared) * cross + 0.5 * sinc(squared / 4) ** 2 * (cross @ cross)
-
-
-class OffsetTables(eqx.Module):
-    """The neighbors of each splat, and weights of sums over them."""
-
-    blurred: Int[Array, "splats _near"]  # over which its offset is averaged
-    around: Int[Array, "splats _around"]  # from which its slope is computed
-    weights: Float[Array, "splats _near"]  # of the average
-    slopes: Float[Array, "splats _around 2"]  # of derivatives, exact for quadratic functions
-    tangents: Float[Array, "splats 2 3"]  # along which they are
-    gain: Float[Array, ""]  # root mean square of blurred noise of root mean square 1
-
-
-class NormalOffsets(AbstractPart):
-    r"""The offset of each splat along its initial normal: a displacement map, no finer than
-    `smoothness`.
-
-        offset = step blur(x),   center = start + offset normal
-
-    The blur is a Gaussian mean over the surface, so an offset changes by no more than its
-    coordinates do. Normals, areas and radii follow from the slopes of the offsets among the
-    neighbors of each splat. A splat farther than 2.5 `smoothness` from all visible ones does not
-    move.
-
-    **Attributes:** (static)
-
-    - `step`: mm.
-    - `smoothness`: standard deviation of the blur, mm; some spacings of the splats. Finer bumps
-      are not searched.
-    - `deviation`: expected size of an offset, one standard deviation of a normal prior, mm.
-    """
-
-    shared = True
-    step: float = eqx.field(static=True)
-    smoothness: float = eqx.field(static=True)
-    deviation: float = eqx.field(static=True)
-
-    def prepared(self, splats: Splats) -> OffsetTables:
-        check_values(
-            "the number of splats",
-            splats.count,
-            f"at least {_SLOPES} for NormalOffsets, which measures slopes among them",
-            lambda x: x >= _SLOPES,
-        )
-        fields = (splats.centers, splats.normals, splats.areas)
-        centers, normals, areas = (np.asarray(field, np.float64) for field in fields)
-        tree = scipy.spatial.KDTree(centers)
-        blurred, weights = _blur(tree, normals, areas, self.smoothness)
-        around, tangents, slopes = _slopes(tree, normals)
-        gain = np.sqrt(np.mean(np.sum(weights**2, axis=1)))
-        indices = (jnp.asarray(neighbors, jnp.int32) for neighbors in (blurred, around))
-        values = (weights, slopes, tangents, gain)
-        return OffsetTables(
-            *indices, *(jnp.asarray(value, splats.centers.dtype) for value in values)
-        )
-
-    def coordinates(self, pictured: PicturedScene) -> Float[Array, " splats"]:
-        return jnp.zeros_like(pictured.splats.areas)
-
-    @jit_unless_traced
-    def moved(self, pictured: PicturedScene, x, prepared: OffsetTables) -> PicturedScene:
-        splats = pictured.splats
-        offsets = self.step * jnp.sum(prepared.weights * x[prepared.blurred], axis=1)
-        shifts = offsets[:, None] * splats.normals
-        apart = shifts[prepared.around] - shifts[:, None]
-        # The tangents of the start, and the slopes of the offsets along them.
-        along = prepared.tangents + jnp.sum(prepared.slopes[..., None] * apart[:, :, None], axis=1)
-        across = jnp.cross(along[:, 0], along[:, 1])
-        stretch = jnp.sqrt(jnp.sum(across * across, axis=1))
-        centers, normals = splats.centers + shifts, across / stretch[:, None]
-        return eqx.tree_at(
-            lambda s: (s.splats.centers, s.splats.normals, s.splats.areas, s.splats.radii),
-            pictured,
-            (centers, normals, splats.areas * stretch, splats.radii * jnp.sqrt(stretch)),
-        )
-
-    def prior(self, x: Float[Array, " splats"], prepared: OffsetTables) -> Float[Array, ""]:
-        return jnp.sum((self.step * prepared.gain / self.deviation * x) ** 2)
-
-
-def _blur(tree: "scipy.spatial.KDTree", normals: np.ndarray, areas: np.ndarray, width: float):
-    """Find neighbors and the weights of a mean over them; neighbors beyond reach and on another
-    side of the body have weight 0.
-    """
-    reach = _REACH * width
-    most = int(np.max(tree.query_ball_point(tree.data, reach, return_length=True)))
-    order = np.arange(1, -(-most // _ROUNDED) * _ROUNDED + 1)
-    distances, near = tree.query(tree.data, k=order, distance_upper_bound=reach, workers=-1)
-    counts = near < len(areas)
-    near = np.where(counts, near, np.arange(len(areas))[:, None])
-    counts &= np.einsum("nki,ni->nk", normals[near], normals) > _SAME_SIDE
-    blur = np.exp(-0.5 * (np.where(counts, distances, 0.0) / width) ** 2)
-    weights = np.where(counts, blur * areas[near], 0.0)
-    return near, weights / np.sum(weights, axis=1, keepdims=True)
-
-
-def _slopes(tree: "scipy.spatial.KDTree", normals: np.ndarray):
-    """Find neighbors, tangents, and the weights of derivatives along them: least squares with
-    quadratic terms.
-    """
-    around = tree.query(tree.data, k=_SLOPES, workers=-1)[1][:, 1:]
-    tangents = np.stack(tangent_frames(normals), axis=1)
-    offsets = tree.data[around] - tree.data[:, None]
-    u, v = np.einsum("nki,nai->ank", offsets, tangents)
-    size = np.sqrt(np.mean(u * u + v * v, axis=1, keepdims=True))
-    u, v = u / size, v / size
-    trust = np.exp(-0.5 * (u * u + v * v)) * (
-        np.einsum("nki,ni->nk", normals[around], normals) > _SAME_SIDE
-    )
-    rows = trust[..., None] * np.stack([u, v, u * u, u * v, v * v], axis=-1)
-    solved = np.linalg.pinv(rows, rcond=1e-3)[:, :2] * trust[:, None] / size[:, None]
-    return around, tangents, solved.transpose(0, 2, 1)

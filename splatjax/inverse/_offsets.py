@@ -1,0 +1,150 @@
+"""Offsets of splats along their normals, and means over the neighbors on a surface."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
+from jaxtyping import Array, Float, Int
+
+from splatjax._chunking import jit_unless_traced
+from splatjax._records import check_values
+from splatjax.geometry import tangent_frames
+from splatjax.scene import Splats
+
+from ._observation import PicturedScene
+from ._parts import AbstractPart
+
+_REACH = 2.5  # of the blur, standard deviations
+_SLOPES = 17  # splats among which slopes are measured, itself included
+_ROUNDED = 16  # neighbors at a time, so that similar bodies share a program
+_SAME_SIDE = 0.3  # least cosine between normals of splats that belong together
+
+
+class SurfaceMean(eqx.Module):
+    """A Gaussian mean over the neighbors of each splat on the same side of the body.
+
+    **Attributes:**
+
+    - `near`: the neighbors; those beyond reach and on another side have weight 0.
+    - `gain`: root mean square of the means of independent noise of deviation 1.
+    """
+
+    near: Int[Array, "splats _near"]
+    weights: Float[Array, "splats _near"]
+    gain: Float[Array, ""]
+
+    @classmethod
+    def of(cls, splats: Splats, width: float) -> "SurfaceMean":
+        """Find the neighbors of splats for a standard deviation, mm."""
+        fields = (splats.centers, splats.normals, splats.areas)
+        centers, normals, areas = (np.asarray(field, np.float64) for field in fields)
+        tree = scipy.spatial.KDTree(centers)
+        reach = _REACH * width
+        most = int(np.max(tree.query_ball_point(centers, reach, return_length=True)))
+        order = np.arange(1, -(-most // _ROUNDED) * _ROUNDED + 1)
+        distances, near = tree.query(centers, k=order, distance_upper_bound=reach, workers=-1)
+        counts = near < len(areas)
+        near = np.where(counts, near, np.arange(len(areas))[:, None])
+        counts &= np.einsum("nki,ni->nk", normals[near], normals) > _SAME_SIDE
+        blur = np.exp(-0.5 * (np.where(counts, distances, 0.0) / width) ** 2)
+        weights = np.where(counts, blur * areas[near], 0.0)
+        weights /= np.sum(weights, axis=1, keepdims=True)
+        gain, dtype = np.sqrt(np.mean(np.sum(weights**2, axis=1))), splats.centers.dtype
+        return cls(
+            jnp.asarray(near, jnp.int32), jnp.asarray(weights, dtype), jnp.asarray(gain, dtype)
+        )
+
+    def __call__(self, rows: Float[Array, "splats columns"]) -> Float[Array, "splats columns"]:
+        return jnp.sum(self.weights[..., None] * rows[self.near], axis=1)
+
+
+class OffsetTables(eqx.Module):
+    """The mean of offsets, the neighbors of each splat, and weights of sums over them."""
+
+    mean: SurfaceMean
+    around: Int[Array, "splats _around"]  # from which the slope of an offset is computed
+    slopes: Float[Array, "splats _around 2"]  # of derivatives, exact for quadratic functions
+    tangents: Float[Array, "splats 2 3"]  # along which they are
+
+
+class NormalOffsets(AbstractPart):
+    r"""The offset of each splat along its initial normal: a displacement map, no finer than
+    `smoothness`.
+
+        offset = step blur(x),   center = start + offset normal
+
+    The blur is a Gaussian mean over the surface, so an offset changes by no more than its
+    coordinates do. Normals, areas and radii follow from the slopes of the offsets among the
+    neighbors of each splat. A splat farther than 2.5 `smoothness` from all visible ones does not
+    move.
+
+    **Attributes:** (static)
+
+    - `step`: mm.
+    - `smoothness`: standard deviation of the blur, mm; some spacings of the splats. Finer bumps
+      are not searched.
+    - `deviation`: expected size of an offset, one standard deviation of a normal prior, mm.
+    """
+
+    shared = True
+    step: float = eqx.field(static=True)
+    smoothness: float = eqx.field(static=True)
+    deviation: float = eqx.field(static=True)
+
+    def prepared(self, splats: Splats) -> OffsetTables:
+        check_values(
+            "the number of splats",
+            splats.count,
+            f"at least {_SLOPES} for NormalOffsets, which measures slopes among them",
+            lambda x: x >= _SLOPES,
+        )
+        around, tangents, slopes = _slopes(
+            np.asarray(splats.centers, np.float64), np.asarray(splats.normals, np.float64)
+        )
+        dtype = splats.centers.dtype
+        return OffsetTables(
+            SurfaceMean.of(splats, self.smoothness),
+            jnp.asarray(around, jnp.int32),
+            jnp.asarray(slopes, dtype),
+            jnp.asarray(tangents, dtype),
+        )
+
+    def coordinates(self, pictured: PicturedScene) -> Float[Array, " splats"]:
+        return jnp.zeros_like(pictured.splats.areas)
+
+    @jit_unless_traced
+    def moved(self, pictured: PicturedScene, x, prepared: OffsetTables) -> PicturedScene:
+        splats = pictured.splats
+        shifts = self.step * prepared.mean(x[:, None]) * splats.normals
+        apart = shifts[prepared.around] - shifts[:, None]
+        # The tangents of the start, and the slopes of the offsets along them.
+        along = prepared.tangents + jnp.sum(prepared.slopes[..., None] * apart[:, :, None], axis=1)
+        across = jnp.cross(along[:, 0], along[:, 1])
+        stretch = jnp.sqrt(jnp.sum(across * across, axis=1))
+        centers, normals = splats.centers + shifts, across / stretch[:, None]
+        return eqx.tree_at(
+            lambda s: (s.splats.centers, s.splats.normals, s.splats.areas, s.splats.radii),
+            pictured,
+            (centers, normals, splats.areas * stretch, splats.radii * jnp.sqrt(stretch)),
+        )
+
+    def prior_residuals(self, x: Float[Array, " splats"], prepared: OffsetTables):
+        return self.step * prepared.mean.gain / self.deviation * x
+
+
+def _slopes(centers: np.ndarray, normals: np.ndarray):
+    """Find neighbors, tangents, and the weights of derivatives along them: least squares with
+    quadratic terms.
+    """
+    around = scipy.spatial.KDTree(centers).query(centers, k=_SLOPES, workers=-1)[1][:, 1:]
+    tangents = np.stack(tangent_frames(normals), axis=1)
+    offsets = centers[around] - centers[:, None]
+    u, v = np.einsum("nki,nai->ank", offsets, tangents)
+    size = np.sqrt(np.mean(u * u + v * v, axis=1, keepdims=True))
+    u, v = u / size, v / size
+    trust = np.exp(-0.5 * (u * u + v * v)) * (
+        np.einsum("nki,ni->nk", normals[around], normals) > _SAME_SIDE
+    )
+    rows = trust[..., None] * np.stack([u, v, u * u, u * v, v * v], axis=-1)
+    solved = np.linalg.pinv(rows, rcond=1e-3)[:, :2] * trust[:, None] / size[:, None]
+    return around, tangents, solved.transpose(0, 2, 1)
