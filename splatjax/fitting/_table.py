@@ -3,7 +3,7 @@ table, interpolated by splines.
 """
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax
@@ -123,7 +123,7 @@ def _spline_shares(
 
 def weight_table(
     profile_of: Callable[..., AbstractProfile],
-    nodes: Mapping[str, Sequence[float] | np.ndarray],
+    nodes: Mapping[str, Numbers],
     base: SumOfGaussians,
 ) -> WeightTable:
     r"""Tabulate the factors on the weights of a base that make it other materials.

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -60,6 +61,6 @@ def randomized_fits(
             perturbed.append(dataclasses.replace(observation, picture=picture, deviation=deviation))
         expected = [jnp.asarray(noise(leaf), leaf.dtype) for leaf in fitted.state.expected]
         state = FitState(fitted.coordinates, None, fitted.state.plans, expected)
-        start = dataclasses.replace(fitted, state=state, losses=np.zeros(0))
+        start = eqx.tree_at(lambda f: (f.state, f.losses), fitted, (state, np.zeros(0)))
         draws.append(fit(perturbed, start=start))
     return draws

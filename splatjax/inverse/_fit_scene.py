@@ -239,7 +239,7 @@ def fit_scene(
         x, state = start.state.x, start.state.optimizer
         plans, times, expected = start.state.plans, start.plans, start.state.expected
         at, losses = start.coordinates, start.losses.tolist()
-        pictures, residuals = start.pictures, start.residuals
+        pictures, residuals = jax.tree.map(np.asarray, (start.pictures, start.residuals))
         best = start.best if losses else None
     if state is None:
         # Optimizers need JAX's default rules of promotion.

@@ -1,5 +1,6 @@
 """What was moved comes back: albedo, lights, cameras, shape. What no picture shows stays."""
 
+import dataclasses
 from functools import cache, partial
 
 import equinox as eqx
@@ -28,7 +29,30 @@ from splatjax.inverse._parts import rotation
 
 SIZE = 16
 camera = partial(view, size=SIZE)
+FALLS = np.asarray([[[0.5, 2.0], [1.0, 3.0]], [[1.0, 0.3], [2.0, 0.5]]])  # of dye and dirt
+
+
+def material() -> sj.Material:
+    gaussians = sj.SumOfGaussians([0.5, 3.0], [[0.5, 0.3], [0.5, 0.7]])
+    return sj.Material(gaussians, eta=1.3, specular=0)
+
+
+def dyed(dye, dirt) -> sj.SumOfGaussians:
+    """The material, with less light where it is dyed."""
+    gaussians, (first, second) = material().gaussians, FALLS
+    fading = np.exp(-first * (dye - 0.5) - second * dirt)
+    return sj.SumOfGaussians(gaussians.variances, gaussians.weights * fading)
+
+
+def parameter_map(**more) -> sj.inverse.ParameterMap:
+    nodes = {"dye": [0.1, 0.3, 0.5, 0.9], "dirt": [-0.3, 0.0, 0.3]}
+    with jax.enable_x64(True):
+        table = sj.fitting.weight_table(dyed, nodes, material().gaussians)
+    return sj.inverse.ParameterMap(table, {"dye": 0.5, "dirt": 0.0}, smoothness=0.5, **more)
+
+
 PARTS = (
+    parameter_map(),
     sj.inverse.AlbedoMap(step=0.2),
     sj.inverse.NormalOffsets(step=0.02, smoothness=2.0, deviation=0.5),
     sj.inverse.LightStrengths(),
@@ -37,17 +61,13 @@ PARTS = (
 )
 
 
-def material() -> sj.Material:
-    gaussians = sj.SumOfGaussians([0.5, 3.0], [[0.5, 0.3], [0.5, 0.7]])
-    return sj.Material(gaussians, eta=1.3, specular=0)
-
-
 @cache
 def body() -> sj.Splats:
     """A bumpy ball with a map, and one on either side that no picture shows."""
     aside = [sphere(18, 4.0, center=(x, 0.0, 0.0)) for x in (-60.0, 60.0)]
     splats = joined(bumpy(160), *aside)
-    return with_albedo(splats, np.random.default_rng(2).uniform(0.3, 0.9, (splats.count, 2)))
+    albedo = np.random.default_rng(2).uniform(0.3, 0.9, (splats.count, 2))
+    return dataclasses.replace(with_albedo(splats, albedo), weights=np.ones((splats.count, 2, 2)))
 
 
 def evaluate(splats: sj.Splats, light: sj.DirectionalLight, picture=0.0, x=None):
@@ -157,6 +177,24 @@ class TestFitScene:
         assert np.median(errors[seen]) < 0.03
         np.testing.assert_allclose(found.splats.albedo[unseen], 0.5, atol=1e-12)
 
+    def test_a_map_of_parameters_comes_back_and_splats_unseen_do_not_move(self):
+        x, y, _ = np.asarray(body().centers).T
+        true = {"dye": 0.4 + 0.2 * np.sin(x / 3), "dirt": 0.15 * np.cos(y / 3)}
+        part, pictured = PARTS[0], PicturedScene(body(), camera(), (lights()[0],))
+        zeros = MovableScene.of(body(), material(), PARTS).start([pictured])
+        # Coordinates of the truth: a blur so narrow that it changes nothing.
+        tables = part.prepared(body())
+        fractions = np.asarray(part.table.fractions(true))
+        logits = np.log(fractions / (1 - fractions)) - np.asarray(tables.start)
+        own = np.linalg.solve(np.asarray(tables.steps), logits[..., None])[..., 0]
+        seen = observations(x=(jnp.asarray(own), *zeros[1:3], *(one[0] for one in zeros[3:])))
+        found = fitted(sj.inverse.ParameterMap, steps=80, seen=seen)
+        visible, unseen = seen_well(body()), np.abs(x) > 20
+        for name, begin in part.start.items():
+            errors = np.abs(np.asarray(found.maps[name]) - true[name])
+            assert np.median(errors[visible]) < 0.02
+            np.testing.assert_allclose(found.maps[name][unseen], begin, atol=1e-12)
+
     def test_lights_come_back(self):
         off = [(0.7, [-1.0, -0.2, -0.5]), (1.3, [0.7, 0.0, -0.7])]
         begin = [
@@ -188,11 +226,11 @@ class TestFitScene:
             np.testing.assert_allclose(ours.rotation @ ours.rotation.T, np.eye(3), atol=1e-12)
 
     def test_a_shape_comes_back(self):
-        part, pictured = PARTS[1], PicturedScene(body(), camera(), (lights()[0],))
+        part, pictured = PARTS[2], PicturedScene(body(), camera(), (lights()[0],))
         zeros = MovableScene.of(body(), material(), PARTS).start([pictured])
         x = jnp.asarray(40 * np.random.default_rng(4).normal(size=body().count))
         dented = part.moved(pictured, x, part.prepared(body())).splats
-        own = (zeros[0], x, *(one[0] for one in zeros[2:]))
+        own = (*zeros[:2], x, *(one[0] for one in zeros[3:]))
         found = fitted(sj.inverse.NormalOffsets, steps=60, seen=observations(x=own))
         before, after = (
             degrees(each.normals, dented.normals)[seen_well(dented)]

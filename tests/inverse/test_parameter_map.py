@@ -1,0 +1,183 @@
+"""Maps of parameters: where they start, what they refuse, and what their error bars mean. The
+pictures are linear in the weights, without a renderer.
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from bodies import assert_close, assert_refused, lights_from_two_sides, sphere, view
+
+import splatjax as sj
+from splatjax.inverse import _fit_scene
+from splatjax.inverse._observation import PicturedScene
+
+COUNT, SIZE, NOISE = 12, 6, 1e-3
+FALLS = np.asarray([[[0.5, 2.0], [1.0, 3.0]], [[1.0, 0.3], [2.0, 0.5]]])
+GAUSSIANS = [0.5, 3.0], [[0.4, 0.3], [0.2, 0.3]]
+START = {"dye": 0.2, "dirt": 0.1}
+OPTIMIZER = optax.chain(optax.lbfgs(1.0, memory_size=24, linesearch=None), optax.clip(3.0))
+
+
+def dyed(dye, dirt) -> sj.SumOfGaussians:
+    variances, weights = GAUSSIANS
+    return sj.SumOfGaussians(variances, weights * np.exp(-FALLS[0] * dye - FALLS[1] * dirt))
+
+
+def make_part(**more) -> sj.inverse.ParameterMap:
+    nodes = {"dye": [0.1, 0.2, 0.4, 0.8], "dirt": [0.0, 0.1, 0.2, 0.3]}
+    table = sj.fitting.weight_table(dyed, nodes, sj.SumOfGaussians(*GAUSSIANS))
+    return sj.inverse.ParameterMap(table, **({"start": START, "smoothness": 4.0} | more))
+
+
+def material() -> sj.Material:
+    return sj.Material(sj.SumOfGaussians(*GAUSSIANS), specular=0)
+
+
+class Frame(eqx.Module):
+    beauty: jax.Array
+    coverage: jax.Array
+    overflow: jax.Array
+
+
+def linear(weights) -> jax.Array:
+    """Sums over splats of the reflectance: each pixel its own."""
+    shares = np.random.default_rng(3).uniform(0, 1, (SIZE, SIZE, COUNT)) ** 4
+    reflectance = jnp.sum(weights * jnp.asarray(GAUSSIANS[1])[None], axis=1)
+    return jnp.tensordot(jnp.asarray(shares), reflectance, 1)
+
+
+@pytest.fixture
+def linear_pictures(monkeypatch):
+    def render(scene, camera, settings, plan):
+        full = jnp.ones((SIZE, SIZE))
+        return Frame(linear(scene.splats.weights), full, jnp.zeros(()))
+
+    monkeypatch.setattr(_fit_scene, "render", render)
+
+
+def camera() -> sj.Camera:
+    return view(size=SIZE)
+
+
+def observation(weights) -> sj.inverse.Observation:
+    picture = np.asarray(linear(weights))
+    picture = picture + NOISE * np.random.default_rng(5).normal(size=picture.shape)
+    return sj.inverse.Observation(
+        picture, camera(), lights_from_two_sides()[:1], deviation=np.full(picture.shape, NOISE)
+    )
+
+
+@pytest.mark.once
+@pytest.mark.usefixtures("double")
+class TestParameterMap:
+    def test_it_starts_where_it_is_given(self):
+        part, ball = make_part(), sphere(COUNT)
+        tables = part.prepared(ball)
+        x = part.coordinates(PicturedScene(ball, camera(), ()))
+        for name, values in part.maps(x, tables).items():
+            np.testing.assert_allclose(values, START[name], rtol=1e-12)
+        moved = part.moved(PicturedScene(ball, camera(), ()), x, tables).splats
+        expected = jnp.broadcast_to(part.table.factors(START), moved.weights.shape)
+        np.testing.assert_allclose(moved.weights, expected, rtol=1e-12)
+        far = part.maps(jnp.full_like(x, 1e3), tables)
+        for name, (low, high) in zip(far, part.table.limits, strict=True):
+            assert np.all((far[name] >= low) & (far[name] <= high))
+
+    def test_a_coordinate_changes_the_color_by_a_step(self):
+        """Without blur and prior, in all directions alike, where parameters resemble each other."""
+        part, ball = make_part(smoothness=1e-3, deviation=1e3, step=1e-4), sphere(COUNT)
+        tables = part.prepared(ball)
+
+        def colors(x):
+            begin = part.table.reflectance(part.table.fractions(START))
+            maps = part.maps(x, tables)
+            return part.table.reflectance(part.table.fractions(maps)) / jnp.mean(begin)
+
+        slopes = np.asarray(jax.jacobian(colors)(jnp.zeros((COUNT, 2))))[0, :, 0]
+        np.testing.assert_allclose(slopes.T @ slopes, 1e-8 * np.eye(2), atol=1e-11)
+
+    @pytest.mark.parametrize(
+        ("more", "message"),
+        [
+            ({"start": {"dye": 0.9, "dirt": 0.1}}, "dye must be between 0.1 and 0.8.*0.9"),
+            ({"start": {"dye": 0.2}}, "given for dye; give dye, dirt"),
+            ({"smoothness": 0.0}, "ParameterMap.smoothness must be positive"),
+        ],
+    )
+    def test_a_start_outside_of_the_table_is_refused(self, more, message):
+        assert_refused(lambda: make_part(**more), message)
+
+    def test_another_material_is_refused(self):
+        other = sj.Material(sj.SumOfGaussians(GAUSSIANS[0], np.ones((2, 2))))
+        part, seen = make_part(), observation(np.ones((COUNT, 2, 2)))
+        assert_refused(
+            lambda: sj.inverse.fit_scene([seen], sphere(COUNT), other, [part], OPTIMIZER, steps=1),
+            r"material\.gaussians\.weights must be that of ParameterMap\.table\.base",
+        )
+
+
+@pytest.mark.once
+@pytest.mark.usefixtures("double", "linear_pictures")
+class TestFits:
+    def fit(self, part):
+        return partial(
+            sj.inverse.fit_scene,
+            splats=sphere(COUNT),
+            material=material(),
+            parts=[part],
+            optimizer=OPTIMIZER,
+        )
+
+    def observed(self, part):
+        rng = np.random.default_rng(7)
+        true = {"dye": rng.uniform(0.15, 0.5, COUNT), "dirt": rng.uniform(0.05, 0.25, COUNT)}
+        return [observation(part.table.factors(true))]
+
+    def test_a_fit_continues_bit_for_bit(self):
+        part = make_part()
+        fit, seen = self.fit(part), self.observed(part)
+        whole = fit(seen, steps=7)
+        parted = fit(seen, steps=4, start=fit(seen, steps=3))
+        assert_close(
+            eqx.filter(parted, eqx.is_array_like), eqx.filter(whole, eqx.is_array_like), rtol=0
+        )
+        assert (parted.best, parted.plans) == (whole.best, whole.plans)
+        # The best step of the first part remains the best one if nothing better follows.
+        better = eqx.tree_at(lambda f: f.losses, whole, np.asarray(whole.losses) - 1e9)
+        again = fit(seen, steps=1, start=better)
+        assert again.best == whole.best
+        assert_close(again.pictures, whole.pictures, rtol=0)
+
+    def test_error_bars_are_those_of_the_dense_jacobian(self):
+        """Of pictures that are nearly linear within the bars."""
+        part, ball = make_part(), sphere(COUNT)
+        fit, seen = self.fit(part), self.observed(part)
+        fitted, tables = fit(seen, steps=60), part.prepared(ball)
+        draws = sj.inverse.randomized_fits(partial(fit, steps=25), seen, fitted, 20)
+
+        def stacked(maps):
+            return jnp.stack([maps[name] for name in START])
+
+        def residuals(x):
+            moved = part.moved(PicturedScene(ball, camera(), ()), x, tables)
+            return (
+                linear(moved.splats.weights).ravel() / NOISE,
+                part.prior_residuals(x, tables).ravel(),
+            )
+
+        x = fitted.coordinates[0]
+        rows = np.concatenate(
+            [np.asarray(leaf).reshape(-1, x.size) for leaf in jax.jacobian(residuals)(x)]
+        )
+        change = jax.jacobian(lambda x: stacked(part.maps(x, tables)))(x)
+        change = np.asarray(change).reshape(-1, x.size)
+        exact = np.sqrt(np.diag(change @ np.linalg.inv(rows.T @ rows) @ change.T))
+        bars = np.std([stacked(draw.maps) for draw in draws], axis=0, ddof=1).ravel()
+        ratio = bars / exact
+        assert abs(np.sqrt(np.mean(ratio**2)) - 1) < 0.15  # 20 draws of 24 bars: 0.04
+        assert abs(np.corrcoef(np.log(bars), np.log(exact))[0, 1]) > 0.9
