@@ -3,11 +3,10 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ._fit_scene import FitState, FittedScene
+from ._fit_scene import FittedScene
 from ._observation import Evidence, Observation
 
 
@@ -60,7 +59,5 @@ def randomized_fits(
             picture = np.asarray(observation.picture) + deviation * noise(deviation)
             perturbed.append(dataclasses.replace(observation, picture=picture, deviation=deviation))
         expected = [jnp.asarray(noise(leaf), leaf.dtype) for leaf in fitted.state.expected]
-        state = FitState(fitted.coordinates, None, fitted.state.plans, expected)
-        start = eqx.tree_at(lambda f: (f.state, f.losses), fitted, (state, np.zeros(0)))
-        draws.append(fit(perturbed, start=start))
+        draws.append(fit(perturbed, start=fitted.restarted(expected)))
     return draws

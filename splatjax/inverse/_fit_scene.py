@@ -150,6 +150,14 @@ class FittedScene(eqx.Module):
     best: int = eqx.field(static=True)
     plans: int = eqx.field(static=True)
 
+    def restarted(self, expected: list[Array] | None = None) -> "FittedScene":
+        """Return the start of a new fit at the best step, by any optimizer; `expected` replaces the
+        means of the residuals of the priors.
+        """
+        expected = self.state.expected if expected is None else expected
+        state = FitState(self.coordinates, None, self.state.plans, expected)
+        return eqx.tree_at(lambda f: (f.state, f.losses), self, (state, np.zeros(0)))
+
 
 def fit_scene(
     observations: Sequence[Observation],
