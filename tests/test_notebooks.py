@@ -21,6 +21,7 @@ LONG = {
     "recover_marble",
     "relight",
     "shape_from_shading",
+    "skin_maps",
     "which_profile",
     *(f"figure_{number}" for number in (1, 4, 5, 6, 7, 8)),  # Figure 3 has no picture to render
 }
