@@ -97,9 +97,8 @@ plot_pictures(
 # %% [markdown]
 # ## A face with freckles and a blush
 #
-# Three pictures under three lights, with noise of 1%. The fit starts from even skin. Its maps are
-# no finer than 0.8 mm. A picture determines the product of an albedo and the reflectance of the
-# skin, so the figurine has no albedo.
+# Three pictures under three lights, with noise of 1%. The fit starts from even skin. A picture
+# determines the product of an albedo and the reflectance of the skin, so the figurine has no albedo.
 
 # %%
 SPLATS, SIZE, NOISE = 800, 36, 0.01
@@ -134,21 +133,22 @@ for lamp in lamps:
 # %% [markdown]
 # ## Fit, and repeat with perturbed pictures
 #
-# Adam comes near, and L-BFGS converges. Fits of perturbed pictures give error bars, of noise and
-# prior.
+# Adam comes near, and L-BFGS goes on. Fits of perturbed pictures give error bars, of noise and
+# prior. Neither fit has converged completely, so that the bars are somewhat too small; more steps
+# remove this error.
 
 # %%
 start = {"melanin": 0.035, "blood": 0.012}
-part = sj.inverse.ParameterMap(table, start, smoothness=0.8)
+part = sj.inverse.ParameterMap(table, start, smoothness=0.3)
 fit = partial(
     sj.inverse.fit_scene, splats=figurine, material=matte, parts=[part], settings=settings
 )
 adam = optax.adam(optax.cosine_decay_schedule(4.0, 20), b2=0.9)
 lbfgs = optax.chain(optax.lbfgs(1.0, memory_size=50, linesearch=None), optax.clip(3.0))
 near = fit(observations, optimizer=adam, steps=20)
-fitted = fit(observations, optimizer=lbfgs, steps=60, start=near.restarted())
-again = partial(fit, optimizer=lbfgs, steps=20)
-draws = sj.inverse.randomized_fits(again, observations, fitted, 6)
+fitted = fit(observations, optimizer=lbfgs, steps=80, start=near.restarted())
+again = partial(fit, optimizer=lbfgs, steps=25)
+draws = sj.inverse.randomized_fits(again, observations, fitted, 5)
 print(f"loss {near.losses[0]:.3g}, {near.losses[-1]:.3g}, {fitted.losses[fitted.best]:.3g}")
 
 lit = (normals[:, 2] > 0.4) & (centers[:, 1] > -6)
@@ -172,7 +172,7 @@ for row, (name, values) in zip(axes, true.items(), strict=True):
     for ax, column, title in zip(row, shown, ("true", "found", "a draw", "bar"), strict=True):
         low, high = (0, 0.3) if title == "bar" else limits
         points = ax.scatter(
-            *centers[lit, :2].T, c=column[lit], s=28, vmin=low, vmax=high, cmap="viridis"
+            *centers[lit, :2].T, c=column[lit], s=60, vmin=low, vmax=high, cmap="viridis"
         )
         ax.set(title=f"{name}, {title}", aspect="equal", xticks=[], yticks=[])
         figure.colorbar(points, ax=ax, shrink=0.7)
