@@ -98,7 +98,8 @@ plot_pictures(
 # ## A face with freckles and a blush
 #
 # Three pictures under three lights, with noise of 1%. The fit starts from even skin. A picture
-# determines the product of an albedo and the reflectance of the skin, so the figurine has no albedo.
+# determines the product of an albedo and the reflectance of the skin, so the figurine has no
+# albedo.
 
 # %%
 SPLATS, SIZE, NOISE = 800, 36, 0.01

@@ -51,7 +51,8 @@ class ParameterMap(AbstractPart):
 
     - `table`: the factors of the parameters, on the Gaussians of the material.
     - `start`: values of each parameter by its name, one for each splat or one for all.
-    - `smoothness`: standard deviation of the blur, mm. Finer detail is not searched.
+    - `smoothness`: standard deviation of the blur, mm. Static. Wider than half the spacing of the
+      splats it makes maps smoother, and fits slower.
     - `deviation`: expected distance of a logit from its start, one standard deviation of a normal
       prior; 2 covers nearly the whole range. Static.
     - `step`: change of the color by a coordinate, relative. Static.
