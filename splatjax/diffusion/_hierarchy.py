@@ -1,7 +1,6 @@
 """Sums over all splats of a body at every splat: near ones one by one, far ones in clusters."""
 
 from collections.abc import Callable
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -61,7 +60,7 @@ class Interactions(eqx.Module):
         sources: PyTree[Array],
         combine: Callable = jax.ops.segment_sum,
     ) -> Float[Array, "results points"]:
-        """Apply a function to points `[..., rows, 1, points]` and sources `[..., rows, sources,
+        """Apply a function to planes of points `[rows, 1, points]` and of sources `[rows, sources,
         1]`, and combine each of its results, `[rows, points]`. Absent sources are 0.
         """
         blocks = jax.tree.leaves(points)[0].shape[-1] // POINTS_PER_BLOCK
@@ -70,27 +69,22 @@ class Interactions(eqx.Module):
         y = jax.tree.map(lambda leaf: _read(leaf, self.sources, self.block), sources)
 
         def of_rows(x, y):
-            x = jax.tree.map(partial(_like, axis=-2), x, points)
-            return jnp.stack(function(x, jax.tree.map(partial(_like, axis=-1), y, sources)), axis=1)
+            x = jax.tree.map(lambda plane: plane[:, None], x)
+            return function(x, jax.tree.map(lambda plane: plane[:, :, None], y))
 
-        rows = map_chunks(of_rows, x, y, at_once=_ROWS)
+        rows = jnp.stack(map_chunks(of_rows, x, y, at_once=_ROWS), axis=1)
         combined = combine(rows, self.points, blocks, indices_are_sorted=True)
         return jnp.swapaxes(combined, 0, 1).reshape(combined.shape[1], -1)
 
 
-def _read(
-    leaf: Float[Array, "*planes elements"], at: Int[Array, "rows blocks"], size: int
-) -> Float[Array, "rows planes row_elements"]:
-    """Read blocks of elements in rows."""
-    blocks = leaf.reshape(-1, leaf.shape[-1] // size, size).swapaxes(0, 1)
-    rows = blocks.at[at].get(mode="fill", fill_value=0).swapaxes(1, 2)
-    return rows.reshape(len(at), blocks.shape[1], -1)
-
-
-def _like(rows: Float[Array, "rows planes row_elements"], leaf: Array, axis: int):
-    """Return rows that were read from a leaf, `[*planes, rows, elements]`, with a new axis."""
-    planes = rows.swapaxes(0, 1).reshape(*leaf.shape[:-1], len(rows), -1)
-    return jnp.expand_dims(planes, axis)
+def _read(leaf: Float[Array, "*planes elements"], at: Int[Array, "rows blocks"], size: int):
+    """Read blocks of elements in rows: a plane `[rows, elements]`, or nested tuples of planes."""
+    blocks = leaf.reshape(-1, leaf.shape[-1] // size, size)
+    rows = blocks.at[:, at].get(mode="fill", fill_value=0)
+    planes = jnp.unstack(rows.reshape(*rows.shape[:2], -1))
+    for length in reversed(leaf.shape[:-1]):
+        planes = [tuple(planes[i : i + length]) for i in range(0, len(planes), length)]
+    return planes[0]
 
 
 class Hierarchy(eqx.Module):
