@@ -15,7 +15,7 @@ from splatjax._records import as_floats
 from splatjax.render import Plan, RenderSettings, render
 from splatjax.scene import AbstractLight, Camera, Material, Splats
 
-from ._movable_scene import Coordinates, MovableScene
+from ._movable_scene import Coordinates, FitState, MovableScene
 from ._observation import (
     AbstractBackground,
     AbstractLoss,
@@ -98,23 +98,6 @@ def advance(
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         updates, state = optimizer.update(gradient, state, x)
     return jax.tree.map(jnp.add, x, updates), state, loss, jnp.all(finite)
-
-
-class FitState(eqx.Module):
-    """The state of a fit after its last step.
-
-    **Attributes:**
-
-    - `x`: the coordinates of the next step.
-    - `optimizer`: its state; `None` to start again.
-    - `plans`: of the pictures.
-    - `expected`: means of the residuals of the priors; zeros but in `randomized_fits`.
-    """
-
-    x: Coordinates
-    optimizer: PyTree
-    plans: list[Plan]
-    expected: list[Array]
 
 
 class FittedScene(eqx.Module):
@@ -244,6 +227,7 @@ def fit_scene(
         expected, state = jax.tree.map(jnp.zeros_like, scene.prior_residuals(x)), None
         best, at, losses, pictures, residuals = None, x, [], (), ()
     else:
+        _check_start(start, scene.start(pictured_scenes), len(observations))
         x, state = start.state.x, start.state.optimizer
         plans, times, expected = start.state.plans, start.plans, start.state.expected
         at, losses = start.coordinates, start.losses.tolist()
@@ -304,6 +288,17 @@ def fit_scene(
         plans=times,
     )
     return result.error_if(fitted, result != optx.RESULTS.successful) if throw else fitted
+
+
+def _check_start(start: FittedScene, x: Coordinates, pictures: int) -> None:
+    """Raise `ValueError` for a fit of other parts, splats or pictures."""
+    ours, given = (jax.tree.map(jnp.shape, coordinates) for coordinates in (x, start.state.x))
+    if ours != given or len(start.state.plans) != pictures:
+        raise ValueError(
+            f"start is a fit of {len(start.state.plans)} pictures with coordinates {given}; "
+            f"{pictures} pictures with {ours} are given. Continue with the same parts, splats and "
+            "number of pictures"
+        )
 
 
 def _check(

@@ -1,4 +1,6 @@
-"""The parts of a scene that may move, together: their coordinates, and what moves by them."""
+"""The parts of a scene that may move, together: their coordinates, what moves by them, and the
+state of a fit.
+"""
 
 from collections.abc import Sequence
 
@@ -6,6 +8,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, PyTree
 
+from splatjax.render import Plan
 from splatjax.scene import Material, Splats
 
 from ._observation import PicturedScene
@@ -74,3 +77,20 @@ class MovableScene(eqx.Module):
         for part, coordinates, prepared in zip(self.parts, x, self.prepared, strict=True):
             maps |= part.maps(coordinates, prepared)
         return maps
+
+
+class FitState(eqx.Module):
+    """The state of a fit after its last step.
+
+    **Attributes:**
+
+    - `x`: the coordinates of the next step.
+    - `optimizer`: its state; `None` to start again.
+    - `plans`: of the pictures.
+    - `expected`: means of the residuals of the priors; zeros but in `randomized_fits`.
+    """
+
+    x: Coordinates
+    optimizer: PyTree
+    plans: list[Plan]
+    expected: list[Array]

@@ -61,10 +61,6 @@ class AbstractPart(eqx.Module):
         """
         return None
 
-    def prior(self, x: PyTree[Array], prepared: PyTree[Array]) -> Float[Array, ""] | float:
-        """Compute the loss of the prior: the sum of its squared residuals."""
-        return sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(self.prior_residuals(x, prepared)))
-
     def maps(self, x: PyTree[Array], prepared: PyTree[Array]) -> dict[str, Float[Array, " splats"]]:
         """Compute the maps of the part, by name; none unless it has parameters of the material."""
         return {}

@@ -152,6 +152,9 @@ class TestFits:
         again = fit(seen, steps=1, start=better)
         assert again.best == whole.best
         assert_close(again.pictures, whole.pictures, rtol=0)
+        assert_refused(
+            lambda: fit(seen * 2, steps=1, start=whole), f"start is a fit of {len(seen)} "
+        )
 
     def test_error_bars_are_those_of_the_dense_jacobian(self):
         """Of pictures that are nearly linear within the bars."""
