@@ -19,7 +19,7 @@ import splatjax as sj
 
 from ._scene import SCENE_FILES, camera_of, check_alone
 from ._terminal import check_folder, check_options, check_output, complete, preview, stage
-from ._view import ViewOptions, draw
+from ._view import PictureOptions
 
 _LARGEST = 16_383  # pixels along a side of a WebP file
 _MOST_FRAMES = 10_000  # that four digits can name
@@ -30,7 +30,7 @@ Rendered = tuple[sj.Frame, sj.Material, tuple[sj.scene.AbstractLight, ...], sj.C
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(ViewOptions):
+class Render(PictureOptions):
     """Render splats, the built-in bust, or a scene: an EXR file with every layer, and a PNG file.
 
     A scene is a TOML file of body, material, lights and camera, or a picture of this command, which
@@ -158,7 +158,7 @@ class Render(ViewOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Turntable(ViewOptions):
+class Turntable(PictureOptions):
     """Render the frames of an animation around splats, or the built-in bust.
 
     Each frame is an EXR file with every layer and a PNG file; the animation turntable.webp plays in
@@ -276,6 +276,22 @@ class Turntable(ViewOptions):
             self.write(paths[i][0], frame, material, scenes[i].lights, cameras[i])
 
         return make
+
+
+def draw(
+    scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings, plan: sj.Plan, light=None
+) -> sj.Frame:
+    """Render, and wait for the picture; the arguments are those of `sj.render`.
+
+    **Raises:** `ValueError` when the plan's capacity is exceeded.
+    """
+    frame = jax.block_until_ready(sj.render(scene, camera, settings, plan, light=light))
+    if not frame.overflow <= 0:
+        raise ValueError(
+            f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times the capacity "
+            "is needed"
+        )
+    return frame
 
 
 def rough_picture(

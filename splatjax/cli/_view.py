@@ -1,4 +1,4 @@
-"""Options that `splatjax render` and `splatjax turntable` share: splats, camera and lights."""
+"""Options that the commands for pictures and the studio share: splats, camera and lights."""
 
 import functools
 import math
@@ -62,17 +62,6 @@ class ViewOptions:
     #: Rotation of the environment about the vertical axis, degrees; at 0 the middle of the map is
     #: the front (+z).
     environment_rotation: float = 0.0
-    #: Model of the light below the surface: the profile of a flat surface (clusters); the same in
-    #: less time, with the sum of the layers alone in the EXR (exitance); or the diffusion equation
-    #: in the closed body, from the coefficients of the material (shape).
-    diffusion: Literal["clusters", "exitance", "shape"] = "clusters"
-    #: Number of times that light may leave the body and enter it again: 1 or 2 brighten folds.
-    bounces: int = 0
-    #: Background of the PNG: black, transparent, or the environment. The EXR has coverage and no
-    #: background.
-    background: Literal["black", "transparent", "environment"] = "black"
-    #: Write the EXR in half precision, except for depth and position.
-    half: bool = False
     #: Exposure of the PNG, in stops: each doubles its brightness. The EXR does not depend on it.
     exposure: float = 0.0
     #: Let light spread below the surface. Without scattering it leaves where it enters.
@@ -104,16 +93,6 @@ class ViewOptions:
             "light_elevation": (math.isfinite(elevation), finite),
             "environment_rotation": (math.isfinite(self.environment_rotation), finite),
             "exposure": (math.isfinite(self.exposure), finite),
-            "background": (
-                self.background != "environment" or self.environment_name is not None,
-                "be black or transparent with single lights and no --environment",
-            ),
-            "bounces": (self.bounces >= 0, "be 0 or more"),
-            "diffusion": (
-                self.diffusion != "shape"
-                or (self.scattering and sj.load_material(self.material).medium is not None),
-                f"be clusters without scattering, or if {self.material} has no [medium]",
-            ),
             "width": (self.width >= 1, positive),
             "height": (self.height >= 1, positive),
             "count": (self.count >= 1, positive),
@@ -157,10 +136,6 @@ class ViewOptions:
             return sj.EnvironmentLight(ENVIRONMENTS[name]())
         return sj.io.load_environment(name) if name else None
 
-    @property
-    def settings(self) -> sj.RenderSettings:
-        return sj.RenderSettings(bounces=self.bounces, diffuser=sj.io.DIFFUSERS[self.diffusion])
-
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
         with stage(
@@ -173,11 +148,6 @@ class ViewOptions:
     def material_for(self, splats: sj.Splats) -> sj.Material:
         material = sj.load_material(self.material)
         if splats.albedo is not None:
-            if self.diffusion == "shape":
-                raise ValueError(
-                    "--diffusion shape computes color from the coefficients of the material, and "
-                    "the splats carry albedo; give --no-albedo"
-                )
             material = material.white()
             note(
                 f"the color is the albedo of the splats, and {self.material} only spreads the "
@@ -236,6 +206,50 @@ class ViewOptions:
         half_angle = math.atan(math.tan(math.radians(self.fov) / 2) * narrower)
         eye = middle + radius / math.sin(half_angle) * direction_to(azimuth, self.elevation)
         return sj.Camera.look_at(eye, middle, fov=self.fov, width=self.width, height=self.height)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions(ViewOptions):
+    """The model of light below the surface, and what the files of a picture contain."""
+
+    #: Model of the light below the surface: the profile of a flat surface (clusters); the same in
+    #: less time, with the sum of the layers alone in the EXR (exitance); or the diffusion equation
+    #: in the closed body, from the coefficients of the material (shape).
+    diffusion: Literal["clusters", "exitance", "shape"] = "clusters"
+    #: Number of times that light may leave the body and enter it again: 1 or 2 brighten folds.
+    bounces: int = 0
+    #: Background of the PNG: black, transparent, or the environment. The EXR has coverage and no
+    #: background.
+    background: Literal["black", "transparent", "environment"] = "black"
+    #: Write the EXR in half precision, except for depth and position.
+    half: bool = False
+
+    def check(self, more_rules: Rules | None = None) -> None:
+        rules: Rules = {
+            "background": (
+                self.background != "environment" or self.environment_name is not None,
+                "be black or transparent with single lights and no --environment",
+            ),
+            "bounces": (self.bounces >= 0, "be 0 or more"),
+            "diffusion": (
+                self.diffusion != "shape"
+                or (self.scattering and sj.load_material(self.material).medium is not None),
+                f"be clusters without scattering, or if {self.material} has no [medium]",
+            ),
+        }
+        super().check(rules | (more_rules or {}))
+
+    @property
+    def settings(self) -> sj.RenderSettings:
+        return sj.RenderSettings(bounces=self.bounces, diffuser=sj.io.DIFFUSERS[self.diffusion])
+
+    def material_for(self, splats: sj.Splats) -> sj.Material:
+        if self.diffusion == "shape" and splats.albedo is not None:
+            raise ValueError(
+                "--diffusion shape computes color from the coefficients of the material, and the "
+                "splats carry albedo; give --no-albedo"
+            )
+        return super().material_for(splats)
 
     def write(
         self,
@@ -297,22 +311,6 @@ class ViewOptions:
                 f"deviations {', '.join(f'{w:.3g}' for w in widths)} mm; more splats resolve "
                 "them, or a smaller body (--scale)"
             )
-
-
-def draw(
-    scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings, plan: sj.Plan, light=None
-) -> sj.Frame:
-    """Render, and wait for the picture; the arguments are those of `sj.render`.
-
-    **Raises:** `ValueError` when the plan's capacity is exceeded.
-    """
-    frame = jax.block_until_ready(sj.render(scene, camera, settings, plan, light=light))
-    if not frame.overflow <= 0:
-        raise ValueError(
-            f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times the capacity "
-            "is needed"
-        )
-    return frame
 
 
 def direction_to(azimuth: float, elevation: float) -> np.ndarray:

@@ -23,7 +23,7 @@ from ._diffuser import (
     LayerValues as LayerValues,
     Sources as Sources,
 )
-from ._exitance import ExitanceDiffuser as ExitanceDiffuser
+from ._exitance import ExitanceDiffuser as ExitanceDiffuser, ExitancePlan as ExitancePlan
 from ._kernel import (
     AbstractDiffusionKernel as AbstractDiffusionKernel,
     EscapeNormalization as EscapeNormalization,

@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -100,10 +101,12 @@ class AbstractDiffusionPlan(eqx.Module):
       others are too narrow for nearly all splats.
     - `forward_mode`: for a diffuser without derivatives in both modes, whether the layers are
       differentiable in forward mode instead of reverse mode. Static.
+    - `separate`: whether there is a layer for each Gaussian, or one with the radiant exitance.
     """
 
     gaussians: Int[Array, " layers"]
     forward_mode: bool = eqx.field(static=True, default=False, kw_only=True)
+    separate: ClassVar[bool] = True
 
     def variances_of_layers(self, variances: Float[Array, " gaussians"]) -> Float[Array, " layers"]:
         """Look up the variances of the layers among those of the Gaussians, mm^2; 1 for a padding
@@ -118,10 +121,16 @@ class AbstractDiffusionPlan(eqx.Module):
         return dataclasses.replace(material, medium=None)
 
     def shown(self, scene: Scene) -> Scene:
-        """Return the scene whose weights apply to the layers that passes 2 and 3 blend: those of
-        the scene, or none where `light` has applied them.
+        """Return the scene whose weights apply to the layers that passes 2 and 3 blend: its own, or
+        the weight 1 of a layer that all splats resolve, where `light` has applied them.
         """
-        return scene
+        if self.separate:
+            return scene
+        gaussians = scene.material.gaussians
+        variances = jnp.full_like(gaussians.variances[:1], _WIDE)
+        one_layer = SumOfGaussians(variances, jnp.ones_like(gaussians.weights[:1]))
+        material = dataclasses.replace(scene.material, gaussians=one_layer)
+        return Scene(dataclasses.replace(scene.splats, weights=None), scene.lights, material)
 
     @abc.abstractmethod
     def diffuse(
@@ -230,12 +239,6 @@ class AbstractDiffuser(eqx.Module):
           where several devices hold them.
         - `interval`: from `AbstractDiffusionKernel.interval`.
         """
-
-
-def one_layer(gaussians: SumOfGaussians) -> SumOfGaussians:
-    """Return one Gaussian of weight 1 in place of others, which all splats resolve."""
-    variances = jnp.full_like(gaussians.variances[:1], _WIDE)
-    return SumOfGaussians(variances, jnp.ones_like(gaussians.weights[:1]))
 
 
 def divide_by_mass(

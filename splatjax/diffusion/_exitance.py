@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
-from splatjax.scene import Material, Scene
+from splatjax.scene import Material
 
 from ._clustered import ClusterDiffuser
 from ._diffuser import (
@@ -16,7 +16,6 @@ from ._diffuser import (
     AbstractDiffusionPlan,
     LayerValues,
     Sources,
-    one_layer,
 )
 from ._points import LayersAtPoints
 from ._shape import ShapeDiffuser
@@ -48,7 +47,7 @@ class ExitanceDiffuser(AbstractDiffuser):
 
     def make_plan(self, parts, variances, kernel, interval):
         layers = self.layers.make_plan(parts, variances, kernel, interval)
-        return ExitancePlan(jnp.zeros(1, jnp.int32), layers, interval)
+        return ExitancePlan.of(layers, interval)
 
 
 class ExitancePlan(AbstractDiffusionPlan):
@@ -62,15 +61,15 @@ class ExitancePlan(AbstractDiffusionPlan):
 
     layers: AbstractDiffusionPlan
     interval: Float[Array, "2"]
+    separate = False
+
+    @classmethod
+    def of(cls, plan: AbstractDiffusionPlan, interval: Float[Array, "2"]) -> AbstractDiffusionPlan:
+        """Sum the layers of a plan, if it has several."""
+        return cls(jnp.zeros(1, jnp.int32), plan, interval) if plan.separate else plan
 
     def material(self, material: Material) -> Material:
         return self.layers.material(material)
-
-    def shown(self, scene: Scene) -> Scene:
-        splats = dataclasses.replace(scene.splats, weights=None)
-        gaussians = one_layer(scene.material.gaussians)
-        material = dataclasses.replace(scene.material, gaussians=gaussians)
-        return Scene(splats, scene.lights, material)
 
     def shares(self):
         return self.layers.shares()

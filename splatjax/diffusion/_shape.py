@@ -20,7 +20,6 @@ from ._diffuser import (
     Beams,
     Diffused,
     LayerValues,
-    one_layer,
 )
 from ._hierarchy import Hierarchy, padded_count
 from ._rays import DiffusionCoefficients, SolvedLight, radiance_towards, scattered_once
@@ -184,9 +183,10 @@ class ShapePlan(AbstractDiffusionPlan):
 
     diffuser: ShapeDiffuser
     hierarchy: Hierarchy
+    separate = False
 
     def material(self, material: Material) -> Material:
-        """Return a material of one Gaussian of weight 1, which all splats resolve.
+        """Return the material, whose surface and coefficients are read.
 
         **Raises:** `ValueError` for a material without coefficients, or with those of other
         channels.
@@ -196,8 +196,8 @@ class ShapePlan(AbstractDiffusionPlan):
                 f"Material.medium is {material.medium}, and ShapeDiffuser needs a Medium of "
                 f"{material.channels} channels; give one, or render with ClusterDiffuser"
             )
-        shown = material.surface_of(one_layer(material.gaussians))
-        return dataclasses.replace(shown, medium=material.medium)
+        surface = material.surface_of(material.gaussians)
+        return dataclasses.replace(surface, medium=material.medium)
 
     def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
         surface = SurfaceSums.of(splats, self.hierarchy)

@@ -166,42 +166,25 @@ class Passes(eqx.Module):
                 "make it with the same settings"
             )
         at = sightlines.first_splats()
-        shown = self.plan.diffusion.shown(self.scene)
-        splats, gaussians, kernel = self.scene.splats, material.gaussians, self.settings.kernel
-        area, albedo = splats.areas[at], splats.albedo
+        summed = _diffusion.ExitancePlan.of(self.plan.diffusion, self.plan.interval)
+        splats, albedo, kernel = self.scene.splats, self.scene.splats.albedo, self.settings.kernel
         root = jnp.ones_like(direct.source) if albedo is None else _shading.albedo_root(albedo.T)
         _, roughness = surface_parameters(self.scene)
-        weights = _diffusion.Sources.of(shown.splats, direct.source).weights
         f0 = _shading.fresnel_f0(material.eta)
         enters = _shading.average_transmission(f0, roughness, material.angular_law())
         enters = enters.reshape(material.channels, -1)
         # The Gaussians also represent light that scatters once: for direct light where it leaves,
         # for bounced light where it enters.
-        total, diffused = material.total_reflectance(), gaussians.total_reflectance()
+        total, diffused = material.total_reflectance(), material.gaussians.total_reflectance()
         added = (total / jnp.where(diffused > 0, diffused, 1.0))[:, None]
 
         def bounce(so_far, _):
             bounced, needed = so_far
             source = (added * direct.entering + bounced) * root
-            diffused, _ = self.plan.diffusion.light(
+            diffused, _ = summed.light(
                 splats, material, source, beams, kernel, self.combination, at, bounced * root
             )
-            layers = _diffusion.LayersAtPoints.of(
-                shown.material.gaussians.variances,
-                self.plan.diffusion.gaussians,
-                diffused.layers.values,
-                None,
-                source[:, at],
-                jnp.where(area > 0, area, 1.0),
-                root[:, at] ** 2,
-                self.plan.interval,
-                kernel,
-                None if weights is None else weights[..., at],
-            )
-            offset, factors = layers.linear_in_means(
-                shown.material.gaussians, material.single_scattering_albedo()
-            )
-            exitance = root[:, at] * (offset + jnp.sum(factors * layers.means, axis=0))
+            exitance = root[:, at] * diffused.layers.values[0]
             received = sightlines.irradiance(exitance, splats.normals, self.combination)
             return (added * enters * received, jnp.maximum(needed, diffused.needed)), None
 

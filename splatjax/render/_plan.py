@@ -1,5 +1,6 @@
 """Plans: the static sizes and orders that `jit`, `grad` and loops need, computed once."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -316,12 +317,11 @@ def _plan_shadows(
         return None
     if isinstance(lights[0], DistantStratum):
         directions = jnp.asarray(_DIRECTIONS, lights[0].direction.dtype)
-        lights = [
-            DistantStratum(direction=direction, irradiance=lights[0].irradiance, cast_shadows=True)
-            for direction in directions
-        ]
-    shadows = settings.shadows_of(lights[0])
-    merged = shadows.splats_per_disc(parts, bounds)
+        lights = [dataclasses.replace(lights[0], direction=toward) for toward in directions]
+    areas = np.concatenate([np.asarray(part.areas) for part in parts])
+    spacing = float(np.sqrt(np.mean(areas[areas > 0]))) if np.any(areas > 0) else np.inf
+    shadows = settings.shadows_of(lights[0]).for_spacing(spacing, bounds)
+    merged = shadows.splats_per_disc(spacing, bounds)
     if merged > 1:
         parts = [_splatting.merge_splats(part, merged) for part in parts]
     of_lights, cube = plan_views(lights, bounds, shadows)

@@ -16,6 +16,7 @@ from splatjax._combination import PartByPart
 from splatjax._precision import full_precision
 from splatjax.scene import (
     AbstractLight,
+    AbstractLightSample,
     Camera,
     Frame,
     Material,
@@ -119,11 +120,14 @@ def render_streamed(
     bounds = _splatting.Bounds(middle, reach)
 
     # Pass 1: the shadow maps of each light that casts shadows, in its group.
+    def views_of(samples: list[AbstractLightSample]):
+        if not samples[0].cast_shadows:
+            return None
+        shadows = settings.shadows_of(samples[0]).for_spacing(statistics.spacing, bounds)
+        return plan_views(samples, bounds, shadows)[0]
+
     of_lights = [
-        plan_views([sample for _, sample in group], bounds, settings.shadows_of(group[0][1]))[0]
-        if group[0][1].cast_shadows
-        else None
-        for group in lights_by_kind(first.lights)
+        views_of([sample for _, sample in group]) for group in lights_by_kind(first.lights)
     ]
     views, structure = jax.tree.flatten(
         of_lights, is_leaf=lambda leaf: isinstance(leaf, _splatting.AbstractView)

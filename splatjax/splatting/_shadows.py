@@ -1,14 +1,13 @@
 """Pass 1: shadow maps, and the fraction of a light that reaches each splat."""
 
-from collections.abc import Sequence
+import dataclasses
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks
+from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks, rounded_up
 from splatjax._combination import AbstractCombination, extreme
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats, rotation_towards
@@ -23,6 +22,7 @@ from ._views import AbstractView, SplattingSettings
 # Factor on the weight sum of full coverage in pictures. Discs extend beyond an open edge; a larger
 # sum makes its shadow extend less. Evenly spread splats always exceed a sum of 1.
 _LESS_COVERED = 2.0
+_LEAST_RESOLUTION = 64
 _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 
 
@@ -31,7 +31,10 @@ class ShadowSettings(eqx.Module):
 
     **Attributes:**
 
-    - `resolution`: pixels along a side of each map.
+    - `resolution`: pixels along a side of each map, at most.
+    - `pixels_per_spacing`: a map has no more pixels than so many per spacing of the splats, rounded
+      up to one of two sizes per octave, and not fewer than 64. Finer ones show discs and not the
+      body. `inf` for the full resolution.
     - `bias`: a surface less than this distance behind that of the map is fully lit, so that a
       surface does not shadow itself. The unit is the reach of the splat in the map: the root of the
       sum of the squares of its radius and of a pixel's diagonal.
@@ -50,15 +53,24 @@ class ShadowSettings(eqx.Module):
     largest_slope: float = eqx.field(static=True, default=8.0)
     compared: int = eqx.field(static=True, default=3)
     merged_spacing: float = eqx.field(static=True, default=0.0)
+    pixels_per_spacing: float = eqx.field(static=True, default=4.0)
 
     def __check_init__(self):
         if self.compared not in (2, 3):
             raise ValueError(f"ShadowSettings.compared is {self.compared}; give 2 or 3 pixels")
 
-    def splats_per_disc(self, parts: Sequence[Splats], bounds: "Bounds") -> int:
+    def for_spacing(self, spacing: float, bounds: "Bounds") -> "ShadowSettings":
+        """Return the settings with the resolution for a spacing of the splats, mm. Not for traced
+        arrays.
+        """
+        finest = self.pixels_per_spacing * 2 * float(bounds.radius) / spacing
+        if finest >= self.resolution:
+            return self
+        resolution = rounded_up(max(int(finest), 1), _LEAST_RESOLUTION, per_octave=2)
+        return dataclasses.replace(self, resolution=min(resolution, self.resolution))
+
+    def splats_per_disc(self, spacing: float, bounds: "Bounds") -> int:
         """Return the number of splats in each merged disc. Not for traced arrays."""
-        areas = np.concatenate([np.asarray(part.areas) for part in parts])
-        spacing = np.sqrt(np.median(areas[areas > 0])) if np.any(areas > 0) else np.inf
         largest = self.merged_spacing * 2 * float(bounds.radius) / self.resolution
         return max((n for n in MERGED_COUNTS if n**0.5 * spacing <= largest), default=1)
 

@@ -21,7 +21,7 @@ def own_cache(tmp_path_factory, jax_settings):
 def plain():
     """Plain renderers, whose program is small: what is tested here does not depend on them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_view.ViewOptions, "settings", PLAIN)
+        patch.setattr(_view.PictureOptions, "settings", PLAIN)
         patch.setattr(_scenes, "RenderSettings", lambda **_: PLAIN)
         yield
 

@@ -11,7 +11,7 @@ from bodies import PLAIN
 import splatjax as sj
 from splatjax.cli import _view, main
 
-_view.ViewOptions.settings = PLAIN
+_view.PictureOptions.settings = PLAIN
 write_png = sj.write_png
 
 

@@ -175,6 +175,23 @@ def test_the_shadow_of_an_open_edge_ends_within_half_a_spacing():
 
 
 @pytest.mark.once
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e3])
+def test_a_map_no_finer_than_its_splats_shows_the_whole_shadow(scale):
+    body, floor = scene()
+    body, blocked = body.scaled(scale), {}
+    for settings in (ShadowSettings(), ShadowSettings(pixels_per_spacing=np.inf)):
+        settings = settings.for_spacing(scale, bounds_of(body))
+        view = distant_view(jnp.asarray([0.3, 0.1, -1.0]), bounds_of(body), settings)
+        visible = visibility(body, view, plan_for(view, body), settings)[:floor]
+        shadow = np.sum((1 - np.asarray(visible, float)) * np.asarray(body.areas[:floor], float))
+        blocked[settings.resolution] = shadow / scale**2
+    assert list(blocked) == [192, 1024]
+    # The disc's shadow extends by half a spacing of its splats.
+    expected = np.pi * (RADIUS + 0.25) ** 2
+    np.testing.assert_allclose(list(blocked.values()), expected, rtol=0.015)
+
+
+@pytest.mark.once
 @pytest.mark.parametrize("kind", [*LIGHTS, "cube"])
 def test_a_sphere_does_not_shadow_itself(kind):
     """Every splat whose cosine to the light is above 0.2 is lit; the discs' own curvature is a
