@@ -6,6 +6,8 @@ length are swept together, one per *lane*; in a step each lane processes the sou
 of its list. The unit of length is the layer's standard deviation times the root of 2.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -48,6 +50,24 @@ class SourceTable(eqx.Module):
             [self.rows, *(self.rows * center[:, None] for center in self.centers)], axis=2
         )
         return products.reshape(len(products), -1, products.shape[-1])
+
+    def contract(
+        self, cotangents: Float[Array, "lanes sums points"]
+    ) -> Float[Array, "lanes sources points"]:
+        """Sum the products of `rows_and_moments` with the cotangents of their sums.
+
+        Written out, so that it is fused with the weights: a gradient takes a fifth less than with a
+        matrix product.
+        """
+        of_sums, rows = jnp.unstack(cotangents[:, :, None], axis=1), jnp.unstack(self.rows, axis=1)
+        per_row = len(of_sums) // len(rows)
+        terms = []
+        for i, row in enumerate(rows):
+            of_row, *of_moments = of_sums[i * per_row : (i + 1) * per_row]
+            for center, of_moment in zip(self.centers, of_moments, strict=self.moments):
+                of_row = of_row + center[..., None] * of_moment
+            terms.append(row[..., None] * of_row)
+        return functools.reduce(jnp.add, terms)
 
     def gather(self, ids: Int[Array, "lanes width"]) -> "SourceTable":
         """Read the blocks of each lane, `[lanes, sources]` and `[lanes, rows, sources]`."""
@@ -188,8 +208,8 @@ def _backward(residuals, cotangents):
             centers = jnp.stack(sources.centers, axis=1)
             origin = centers[:, :, :1]
             x, p = lane_points - origin, centers - origin
-            rows, pull_rows = jax.vjp(SourceTable.rows_and_moments, sources)
-            g = minus_slopes * jnp.einsum("lrs,lrp->lsp", rows, cotangent)
+            _, pull_rows = jax.vjp(SourceTable.rows_and_moments, sources)
+            g = minus_slopes * sources.contract(cotangent)
             # Sum over the points: the cotangents of the sources.
             one_and_x = jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1)
             over_points = jnp.einsum("lkp,lsp->lks", one_and_x, g)
