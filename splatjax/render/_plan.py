@@ -317,7 +317,7 @@ def _plan_shadows(
         return None
     if isinstance(lights[0], DistantStratum):
         directions = jnp.asarray(_DIRECTIONS, lights[0].direction.dtype)
-        lights = [dataclasses.replace(lights[0], direction=toward) for toward in directions]
+        lights = [dataclasses.replace(lights[0], direction=direction) for direction in directions]
     areas = np.concatenate([np.asarray(part.areas) for part in parts])
     spacing = float(np.sqrt(np.mean(areas[areas > 0]))) if np.any(areas > 0) else np.inf
     shadows = settings.shadows_of(lights[0]).for_spacing(spacing, bounds)

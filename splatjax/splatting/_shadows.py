@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks, rounded_up
 from splatjax._combination import AbstractCombination, extreme
+from splatjax._records import check_values
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats, rotation_towards
 
@@ -58,15 +59,22 @@ class ShadowSettings(eqx.Module):
     def __check_init__(self):
         if self.compared not in (2, 3):
             raise ValueError(f"ShadowSettings.compared is {self.compared}; give 2 or 3 pixels")
+        check_values(
+            "ShadowSettings.pixels_per_spacing",
+            self.pixels_per_spacing,
+            "positive; inf for the full resolution",
+            lambda x: x > 0,
+            finite=False,
+        )
 
     def for_spacing(self, spacing: float, bounds: "Bounds") -> "ShadowSettings":
         """Return the settings with the resolution for a spacing of the splats, mm. Not for traced
         arrays.
         """
-        finest = self.pixels_per_spacing * 2 * float(bounds.radius) / spacing
-        if finest >= self.resolution:
+        across = self.pixels_per_spacing * 2 * float(bounds.radius)
+        if across >= self.resolution * spacing:
             return self
-        resolution = rounded_up(max(int(finest), 1), _LEAST_RESOLUTION, per_octave=2)
+        resolution = rounded_up(max(int(across / spacing), 1), _LEAST_RESOLUTION, per_octave=2)
         return dataclasses.replace(self, resolution=min(resolution, self.resolution))
 
     def splats_per_disc(self, spacing: float, bounds: "Bounds") -> int:

@@ -192,6 +192,13 @@ def test_a_map_no_finer_than_its_splats_shows_the_whole_shadow(scale):
 
 
 @pytest.mark.once
+@pytest.mark.parametrize("number", [0.0, -1.0, np.nan])
+def test_a_map_without_pixels_is_refused(number):
+    refused = "pixels_per_spacing.*positive"
+    bodies.assert_refused(lambda: ShadowSettings(pixels_per_spacing=number), refused)
+
+
+@pytest.mark.once
 @pytest.mark.parametrize("kind", [*LIGHTS, "cube"])
 def test_a_sphere_does_not_shadow_itself(kind):
     """Every splat whose cosine to the light is above 0.2 is lit; the discs' own curvature is a
