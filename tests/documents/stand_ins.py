@@ -136,7 +136,8 @@ def lay_out_frame(folder: Path, text: str) -> None:
 
 
 WITH_CONTEXT = {
-    f"docs/{name}.md" for name in ("devices", "gradients", "figures", "baselines", "recovery")
+    f"docs/{name}.md"
+    for name in ("devices", "gradients", "figures", "baselines", "recovery", "fit_scene")
 }
 
 
