@@ -137,7 +137,7 @@ outline.
 
 PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"
 BEGIN, END = "<!-- table: tools/make_bodies.py -->", "<!-- end of table -->"
-TITLES = ("body", "model", "error: red", "green", "blue", "FLIP", "seconds")
+TITLES = ("body", "model", "error: red, green, blue", "FLIP", "seconds")
 TITLES += ("path tracer's seconds to the same error",)
 
 
@@ -246,7 +246,7 @@ def splatted(
     return np.asarray(frame.beauty, np.float64), seconds
 
 
-def row(body: Body, name: str, truth: Truth, picture: np.ndarray, seconds: float) -> str:
+def row(what: str, name: str, truth: Truth, picture: np.ndarray, seconds: float) -> str:
     """Return a row of the table: per channel the root mean square error over that of the truth,
     whose noise is subtracted; the FLIP error; and times.
     """
@@ -260,8 +260,8 @@ def row(body: Body, name: str, truth: Truth, picture: np.ndarray, seconds: float
     shown = [linear_to_srgb(image).astype(np.float32) for image in masked]
     flip = float(flip_evaluator.evaluate(*shown, "LDR")[1])
     equal = truth.seconds * (noise / power).mean() / np.mean(np.square(rms))
-    channels = [f"{100 * value:.1f}%" for value in rms]
-    return line(body.what, name, *channels, f"{flip:.3f}", f"{seconds:.2f}", f"{equal:.1f}")
+    errors = ", ".join(f"{100 * value:.1f}" for value in rms) + "%"
+    return line(what, name, errors, f"{flip:.3f}", f"{seconds:.2f}", f"{equal:.1f}")
 
 
 def line(*cells: str) -> str:
@@ -296,8 +296,9 @@ def main() -> None:
         truth, splats, pictures = read_truth(body, folder), splats_of(body), {}
         print(f"{body.name}: {np.sum(~truth.sound)} pixels of the truth left out", flush=True)
         for name, (material, settings) in compared.items():
+            what = "" if pictures else body.what  # once for all rows of a body
             pictures[name], seconds = splatted(body, splats, material, settings)
-            rows.append(row(body, name, truth, pictures[name], seconds))
+            rows.append(row(what, name, truth, pictures[name], seconds))
             print(rows[-1], flush=True)
         shown.append((truth, pictures))
         jax.clear_caches()  # the programs of all bodies are more than one process may hold
