@@ -32,7 +32,7 @@ SAMPLES, PASSES = 128, 4
 """Paths per pixel of a pass, and passes."""
 ALBEDO = (0.9, 0.98, 0.998)
 SIGMA_T = 1.0
-"""1/mm; isotropic scattering, and no change of index at the surface."""
+"""1/mm; isotropic scattering."""
 IRRADIANCE = float(np.pi)
 Place = tuple[float, float, float]
 
@@ -52,6 +52,7 @@ class Body(NamedTuple):
     fov: float
     count: int
     blocker: tuple[Place, tuple[float, float]] | None = None
+    eta: float = 1.0
 
 
 def head() -> trimesh.Trimesh:
@@ -83,6 +84,14 @@ BODIES = [
     Body("sphere", f"{SPHERE}, lit from the side", sphere, lamp(-1, -1, -1), *FROM_SPHERE),
     Body("sphere_studio", f"{SPHERE} in the studio", sphere, STUDIO, *FROM_SPHERE),
     Body(
+        "sphere_refracting",
+        f"{SPHERE} in the studio, eta 1.4",
+        sphere,
+        STUDIO,
+        *FROM_SPHERE,
+        eta=1.4,
+    ),
+    Body(
         "sphere_softbox",
         f"{SPHERE} beside a square light of 40 x 40",
         sphere,
@@ -112,6 +121,7 @@ BODIES = [
     ),
     Body("head", f"{HEAD}, lit from the front", head, lamp(-0.7, -0.5, -1), *FROM_HEAD),
     Body("head_studio", f"{HEAD} in the studio", head, STUDIO, *FROM_HEAD),
+    Body("head_refracting", f"{HEAD} in the studio, eta 1.4", head, STUDIO, *FROM_HEAD, eta=1.4),
     Body(
         "head_softbox",
         f"{HEAD} beside a square light of 300 x 300",
@@ -170,20 +180,21 @@ def read_truth(body: Body, folder: Path) -> Truth:
     return Truth(mean, variance, seconds, sound, 0.8 / float(np.quantile(mean, 0.98)))
 
 
-def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
+@functools.cache
+def models(eta: float) -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
     """Return what is compared: material and settings, by name."""
     albedo = jnp.asarray(ALBEDO)
-    medium = sj.Medium(SIGMA_T * (1 - albedo), SIGMA_T * albedo, jnp.ones(len(ALBEDO)))
+    medium = sj.Medium(SIGMA_T * (1 - albedo), SIGMA_T * albedo, eta)
     model, single = sj.fitting.TransportModel(), sj.SingleScattering(medium)
     half_space, beam = model.half_space(medium), model.profile(medium)
     apart = single.directional_albedo(jnp.asarray(half_space.cosines()))
-    flat = fitted(beam)
+    flat = fitted(beam, eta)
     whole, solved = (
         dataclasses.replace(flat, angles=model.angles(medium)),
         dataclasses.replace(flat, medium=medium),
     )
     parted = dataclasses.replace(
-        fitted(beam.multiply_scattered()),
+        fitted(beam.multiply_scattered(), eta),
         single_scattering=single,
         angles=half_space.angular_law(apart),
     )
@@ -201,7 +212,7 @@ def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
     }
 
 
-def fitted(profile: sj.gaussians.AbstractProfile) -> sj.Material:
+def fitted(profile: sj.gaussians.AbstractProfile, eta: float) -> sj.Material:
     """Fit six Gaussians as `splatjax fit` does; the surface itself reflects nothing."""
     weights = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
     rule = sj.fitting.TransportModel.rule
@@ -209,7 +220,7 @@ def fitted(profile: sj.gaussians.AbstractProfile) -> sj.Material:
         profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), profile)
         gaussians = sj.fit_gaussians(profile, 6, weights=weights, rule=rule).gaussians
     gaussians = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), gaussians)
-    return sj.Material(gaussians, eta=1.0, specular=0.0)
+    return sj.Material(gaussians, eta=eta, specular=0.0)
 
 
 def splats_of(body: Body) -> sj.Splats:
@@ -290,12 +301,12 @@ def draw(shown: list[tuple[Truth, dict[str, np.ndarray]]], path: Path) -> None:
 def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/bodies")
     chosen = [body for body in BODIES if len(sys.argv) < 3 or body.name in sys.argv[2:]]
-    compared, shown = models(), []
+    shown = []
     rows = [BEGIN, "", line(*TITLES), line(*["---"] * len(TITLES))]
     for body in chosen:
         truth, splats, pictures = read_truth(body, folder), splats_of(body), {}
         print(f"{body.name}: {np.sum(~truth.sound)} pixels of the truth left out", flush=True)
-        for name, (material, settings) in compared.items():
+        for name, (material, settings) in models(body.eta).items():
             what = "" if pictures else body.what  # once for all rows of a body
             pictures[name], seconds = splatted(body, splats, material, settings)
             rows.append(row(what, name, truth, pictures[name], seconds))

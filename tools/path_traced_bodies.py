@@ -17,17 +17,18 @@ import splatjax as sj
 from splatjax.io import atomic_path
 
 
-def scene(mi, body: Body, mesh: Path):
-    """Describe a medium inside a boundary that neither reflects nor bends; isotropic scattering;
-    lights are not seen themselves.
+def scene(mi, body: Body, mesh: Path, albedo=ALBEDO):
+    """Describe a medium of isotropic scattering inside a boundary that is smooth, or, at index 1,
+    neither reflects nor bends; lights are not seen themselves.
     """
     transform = mi.ScalarTransform4f
     medium = {
         "type": "homogeneous",
         "sigma_t": SIGMA_T,
-        "albedo": {"type": "rgb", "value": list(ALBEDO)},
+        "albedo": {"type": "rgb", "value": list(albedo)},
         "phase": {"type": "isotropic"},
     }
+    smooth = {"type": "dielectric", "int_ior": body.eta, "ext_ior": 1.0}
     view = transform().look_at(origin=list(body.eye), target=list(body.target), up=[0, 1, 0])
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     description = {
@@ -41,8 +42,8 @@ def scene(mi, body: Body, mesh: Path):
         "body": {
             "type": "ply",
             "filename": str(mesh),
-            "face_normals": True,
-            "bsdf": {"type": "null"},
+            "face_normals": body.eta == 1,
+            "bsdf": {"type": "null"} if body.eta == 1 else smooth,
             "interior": medium,
         },
         "light": emitter(mi, body.light),
@@ -85,19 +86,25 @@ def emitter(mi, light: sj.scene.AbstractLight) -> dict:
 
 
 def trace(mi, body: Body, path: Path) -> None:
-    """Write the sums of the passes and of their squares."""
+    """Write the sums of the passes and of their squares. What a smooth boundary reflects, and the
+    light that passes unscattered, are traced in a black medium and subtracted.
+    """
     mesh = path.with_suffix(".ply")
     body.shape().export(mesh)
     described, total, squares, seconds = scene(mi, body, mesh), 0.0, 0.0, np.inf
-    for number in track(range(PASSES), description=body.name):
+    black = scene(mi, body, mesh, (0.0, 0.0, 0.0))
+    passes = PASSES if body.eta == 1 else 4 * PASSES  # without connections to the lights
+    for number in track(range(passes), description=body.name):
         start = time.perf_counter()
         picture = np.array(mi.render(described, spp=SAMPLES, seed=number), np.float64)
         seconds = min(seconds, time.perf_counter() - start)
+        if body.eta != 1:
+            picture -= np.array(mi.render(black, spp=SAMPLES, seed=number), np.float64)
         if not np.isfinite(picture).all():
             raise ValueError(f"{path}: pass {number} has values that are not finite")
         total, squares = total + picture, squares + picture**2
     with atomic_path(path) as temporary:
-        np.savez(temporary, total=total, squares=squares, seconds=seconds, passes=PASSES)
+        np.savez(temporary, total=total, squares=squares, seconds=seconds, passes=passes)
 
 
 def main() -> None:

@@ -10,9 +10,9 @@ from splatjax import splatting as _splatting
 from splatjax.render import Irradiance, LightVisibility, irradiance_at_splats
 from splatjax.scene import (
     AbstractLightSample,
+    AbstractPointSample,
     DirectionalLight,
     Material,
-    PointLight,
     Scene,
     Splats,
     stack_lights,
@@ -69,7 +69,7 @@ def light_views(
             views.append(None)
         elif isinstance(light, DirectionalLight):
             views.append(_splatting.distant_view(light.direction, bounds, settings))
-        elif isinstance(light, PointLight):
+        elif isinstance(light, AbstractPointSample):
             views.append(_splatting.near_view(light.position, bounds, settings))
         else:
             raise ValueError(
@@ -88,7 +88,7 @@ def shadow_capacities(
     """
     bounds = mesh.bounds()
     for i, light in enumerate(lights):
-        if isinstance(light, PointLight) and light.cast_shadows:
+        if isinstance(light, AbstractPointSample) and light.cast_shadows:
             distance = float(jnp.linalg.norm(light.position - bounds.center))
             if distance < 1.05 * float(bounds.radius):
                 raise ValueError(

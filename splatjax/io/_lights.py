@@ -2,7 +2,6 @@
 lights.
 """
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from splatjax.scene import (
     PointLight,
     RectangleLight,
     SphereLight,
+    SpotLight,
     overcast_sky,
     studio,
     sun_and_sky,
@@ -37,16 +37,19 @@ PLACE = ("position", "target", "up", "fov")
 _MOST_ROWS = 512  # of an environment
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
 ENVIRONMENTS = {"studio": studio, "overcast": overcast_sky, "sun": sun_and_sky}
-# Entries that may be missing.
-_OPTIONAL = ("rotation", "strength", "up", "directions", "count", "cast_shadows")
+# Entries that may be missing, of environments and of spot lights.
+_OF_MAPS = ("rotation", "strength", "up", "directions", "count", "cast_shadows")
+_ANGLES = ("inner_angle", "outer_angle")
+_OPTIONAL = _OF_MAPS + _ANGLES
 _LIGHTS = {
     "directional": (DirectionalLight, ("direction", "irradiance", "cast_shadows")),
     "point": (PointLight, ("position", "intensity", "cast_shadows")),
+    "spot": (SpotLight, ("position", "direction", "intensity", *_ANGLES, "cast_shadows")),
     "beam": (GaussianBeam, ("origin", "direction", "power", "variance")),
     "rectangle": (RectangleLight, ("center", "radiance", "edges", "count", "cast_shadows")),
     "disk": (DiskLight, ("center", "radiance", "direction", "radius", "count", "cast_shadows")),
     "sphere": (SphereLight, ("center", "radiance", "radius", "count", "cast_shadows")),
-    "environment": (EnvironmentLight, ("image", *_OPTIONAL)),
+    "environment": (EnvironmentLight, ("image", *_OF_MAPS)),
 }
 LIGHT_ENTRIES = {"kind"}.union(*(names for _, names in _LIGHTS.values()))
 
@@ -74,8 +77,8 @@ def load_lights(
     r"""Read the punctual lights of a glTF or GLB file (KHR_lights_punctual).
 
     A surface that faces a directional light of 1 lux receives the irradiance `lux`, and so does
-    one that is 1 unit of length from a point light of 1 candela: with `lux` 1, pictures are in
-    candela per square meter. Spot lights are read as point lights, with a warning.
+    one that is 1 unit of length from a point or spot light of 1 candela: with `lux` 1, pictures
+    are in candela per square meter.
 
     **Arguments:**
 
@@ -87,17 +90,19 @@ def load_lights(
     path, lights = existing_file(path), []
     check_units(path, mm_per_unit, up)
     with one_sentence(path):
-        for name, light, matrix in gltf_nodes(path, "light"):
+        for _, light, matrix in gltf_nodes(path, "light"):
             color = np.asarray(light.get("color", (1, 1, 1))) * lux * light.get("intensity", 1)
             place, direction = with_y_up(np.stack([matrix[:3, 3], -matrix[:3, 2]]), up)
+            position, intensity = mm_per_unit * place, mm_per_unit**2 * color
             if light["type"] == "directional":
                 lights.append(DirectionalLight(direction=direction, irradiance=color))
+            elif light["type"] == "spot":
+                cone = light.get("spot", {})
+                defaults = (("innerConeAngle", 0.0), ("outerConeAngle", np.pi / 4))
+                angles = (np.degrees(cone.get(key, default)) for key, default in defaults)
+                lights.append(SpotLight(position, direction, intensity, *angles))
             else:
-                intensity = mm_per_unit**2 * color
-                lights.append(PointLight(position=mm_per_unit * place, intensity=intensity))
-            if light["type"] == "spot":
-                read_as = f"the light {name!r} is a spot, and is read as a point light"
-                warnings.warn(f"{path}: {read_as}", stacklevel=2)
+                lights.append(PointLight(position=position, intensity=intensity))
     return lights
 
 
@@ -117,7 +122,8 @@ def read_observations(path: StrPath) -> list[Observation]:
         irradiance = [3.14, 3.14, 3.14]
 
     A camera may have `up`. Other kinds of lights are "point" (`position` in mm, `intensity`,
-    `cast_shadows`), "beam" (`origin`, `direction`, `power`, `variance` in mm^2), and "rectangle",
+    `cast_shadows`), "spot" (a point light with `direction`, `inner_angle` and `outer_angle` in
+    degrees), "beam" (`origin`, `direction`, `power`, `variance` in mm^2), and "rectangle",
     "disk" and "sphere" (`center`, `radiance`; `edges`, or `direction` and `radius`, or `radius`;
     `cast_shadows`). Color is one number per channel, or one for all.
 

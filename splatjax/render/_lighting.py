@@ -11,12 +11,11 @@ from splatjax import diffusion as _diffusion, shading as _shading, splatting as 
 from splatjax._combination import AbstractCombination
 from splatjax.scene import (
     AbstractLightSample,
+    AbstractPointSample,
     DirectionalLight,
     DistantStratum,
-    EmitterStratum,
     GaussianBeam,
     Material,
-    PointLight,
     Scene,
     StackedLights,
     stack_lights,
@@ -50,7 +49,7 @@ class ShadowPlan(eqx.Module):
         """Compute a number above 1 for a point light that was outside the splats' bounding sphere
         when planned, and is now inside.
         """
-        if self.cube or not isinstance(light, PointLight | EmitterStratum):
+        if self.cube or not isinstance(light, AbstractPointSample):
             return jnp.zeros_like(bounds.radius)
         distance = jnp.linalg.norm(light.position - bounds.center)
         return jax.lax.stop_gradient(bounds.radius / distance)
@@ -67,7 +66,7 @@ def plan_views(
     cube = any(
         float(jnp.linalg.norm(light.position - bounds.center)) < _NEARLY * float(bounds.radius)
         for light in lights
-        if isinstance(light, PointLight | EmitterStratum)
+        if isinstance(light, AbstractPointSample)
     )
     return [shadow_views(light, bounds, settings, cube) for light in lights], cube
 
@@ -81,7 +80,7 @@ def shadow_views(
     """Return the views of a light's shadow maps: one of all splats, or the six faces of a cube."""
     if isinstance(light, DirectionalLight | GaussianBeam | DistantStratum):
         return [_splatting.distant_view(light.direction, bounds, settings)]
-    if not isinstance(light, PointLight | EmitterStratum):
+    if not isinstance(light, AbstractPointSample):
         raise ValueError(
             f"{type(light).__name__} has no shadow map; give a light with cast_shadows=False"
         )

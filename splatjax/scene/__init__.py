@@ -17,19 +17,23 @@ from ._formulas import (
     studio as studio,
     sun_and_sky as sun_and_sky,
 )
+from ._light_groups import (
+    lights_by_kind as lights_by_kind,
+    stack_lights as stack_lights,
+    StackedLights as StackedLights,
+)
 from ._lights import (
     AbstractExtendedLight as AbstractExtendedLight,
     AbstractHighlight as AbstractHighlight,
     AbstractLight as AbstractLight,
     AbstractLightSample as AbstractLightSample,
+    AbstractPointSample as AbstractPointSample,
     DirectionalLight as DirectionalLight,
     DistantStratum as DistantStratum,
     EmitterStratum as EmitterStratum,
     GaussianBeam as GaussianBeam,
     PointLight as PointLight,
-    lights_by_kind as lights_by_kind,
-    stack_lights as stack_lights,
-    StackedLights as StackedLights,
+    SpotLight as SpotLight,
 )
 from ._material import Material as Material
 from ._scene import (

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
 from splatjax._records import check_values, numbers, record
+from splatjax._smooth import smooth_step
 from splatjax.gaussians import gaussian
 
 _TOUCHING = 1e-6  # mm
@@ -168,8 +169,25 @@ class DirectionalLight(AbstractLightSample):
         return jnp.broadcast_to(wi, points.shape), _per_channel(self.irradiance, points)
 
 
+class AbstractPointSample(AbstractLightSample):
+    """Light from a point, with inverse-square falloff."""
+
+    position: eqx.AbstractVar[Float[Array, "3"]]
+    intensity: eqx.AbstractVar[Float[Array, " channels"]]
+
+    def incidence(
+        self, points: Float[Array, "*points 3"]
+    ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+        to_light = jnp.broadcast_to(self.position, points.shape) - points
+        squared = jnp.sum(to_light * to_light, axis=-1, keepdims=True)
+        apart = squared > _TOUCHING**2
+        squared = jnp.where(apart, squared, 1.0)
+        wi = jnp.where(apart, to_light / jnp.sqrt(squared), 0.0)
+        return wi, jnp.where(apart, _per_channel(self.intensity, points) / squared, 0.0)
+
+
 @record
-class PointLight(AbstractLightSample):
+class PointLight(AbstractPointSample):
     r"""Light from a point, with inverse-square falloff.
 
     A surface point within 1e-6 mm of the light receives no light: the limit diverges, so value and
@@ -188,15 +206,46 @@ class PointLight(AbstractLightSample):
     strength_field: ClassVar[str] = "intensity"
     cast_shadows: bool = eqx.field(static=True, default=True)
 
+
+@record
+class SpotLight(AbstractPointSample):
+    r"""A point light whose light is limited to a cone.
+
+    From the inner to the outer angle the intensity falls to 0, by a smooth step in the cosine of
+    the angle to the axis (as `SpotLight` of pbrt).
+
+    **Attributes:**
+
+    - `position`: mm. Differentiable.
+    - `direction`: of the axis, the way the light travels, any length but zero. Differentiable.
+    - `intensity`: power per solid angle inside the inner cone. Differentiable.
+    - `inner_angle`, `outer_angle`: degrees from the axis, at most 180. Differentiable.
+    - `cast_shadows`: whether it has a shadow map. Static.
+
+    **Raises:** `ValueError` unless the outer angle is larger than the inner one.
+    """
+
+    position: Float[Array, "3"] = eqx.field(converter=numbers)
+    direction: Float[Array, "3"] = eqx.field(converter=numbers)
+    intensity: Float[Array, " channels"] = eqx.field(converter=numbers)
+    inner_angle: Float[Array, ""] = eqx.field(converter=numbers, default=20.0)
+    outer_angle: Float[Array, ""] = eqx.field(converter=numbers, default=30.0)
+    strength_field: ClassVar[str] = "intensity"
+    cast_shadows: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self):
+        inner, outer = self.inner_angle, self.outer_angle
+        check_values("SpotLight.inner_angle", inner, "at least 0 degrees", lambda x: x >= 0)
+        larger = "larger than inner_angle, and at most 180 degrees"
+        check_values("SpotLight.outer_angle", outer, larger, lambda x: (x > inner) & (x <= 180))
+
     def incidence(
         self, points: Float[Array, "*points 3"]
     ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        to_light = jnp.broadcast_to(self.position, points.shape) - points
-        squared = jnp.sum(to_light * to_light, axis=-1, keepdims=True)
-        apart = squared > _TOUCHING**2
-        squared = jnp.where(apart, squared, 1.0)
-        wi = jnp.where(apart, to_light / jnp.sqrt(squared), 0.0)
-        return wi, jnp.where(apart, _per_channel(self.intensity, points) / squared, 0.0)
+        wi, irradiance = super().incidence(points)
+        cosine = -jnp.tensordot(wi, self.direction / jnp.linalg.norm(self.direction), 1)
+        inner, outer = (jnp.cos(jnp.radians(x)) for x in (self.inner_angle, self.outer_angle))
+        return wi, irradiance * smooth_step(cosine, outer, inner)[..., None]
 
 
 class DistantStratum(AbstractLightSample):
@@ -209,7 +258,7 @@ class DistantStratum(AbstractLightSample):
     incidence = DirectionalLight.incidence
 
 
-class EmitterStratum(AbstractLightSample):
+class EmitterStratum(AbstractPointSample):
     """A part of an area light, as a point: fields as of `PointLight`.
 
     **Attributes:**
@@ -226,7 +275,7 @@ class EmitterStratum(AbstractLightSample):
     def incidence(
         self, points: Float[Array, "*points 3"]
     ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        wi, irradiance = PointLight.incidence(self, points)  # ty: ignore[invalid-argument-type]
+        wi, irradiance = super().incidence(points)
         if self.normal is None:
             return wi, irradiance
         return wi, irradiance * jnp.maximum(-jnp.tensordot(wi, self.normal, 1), 0)[..., None]
@@ -260,59 +309,3 @@ class GaussianBeam(AbstractLightSample):
         across = offset - jnp.sum(offset * axis, axis=-1, keepdims=True) * axis
         squared = jnp.sum(across * across, axis=-1, keepdims=True)
         return -axis, _per_channel(self.power, points) * gaussian(self.variance, squared)
-
-
-class StackedLights(eqx.Module):
-    """Samples of lights of one kind, their leaves stacked, and for each the index of its light in
-    the scene's tuple; also the highlight of each light, if it has one.
-    """
-
-    lights: AbstractLightSample
-    light_indices: tuple[int, ...] = eqx.field(static=True)
-    highlights: tuple[AbstractHighlight, ...] = ()
-
-    @property
-    def distinct(self) -> tuple[int, ...]:
-        """List the distinct indices of the lights."""
-        return tuple(dict.fromkeys(self.light_indices))
-
-    def mean_per_light(
-        self, rows: Float[Array, "samples points"], weights: Float[Array, "samples points"]
-    ) -> Float[Array, "lights points"]:
-        """Average the rows of the samples of each light."""
-        light, sample = jnp.asarray(self.distinct)[:, None], jnp.asarray(self.light_indices)[None]
-        member = (light == sample).astype(rows.dtype)
-        total = member @ weights
-        mean = member @ (weights * rows) / jnp.where(total > 0, total, 1.0)
-        return jnp.where(total > 0, mean, 1.0)
-
-    def per_sample(self, rows: Float[Array, "lights points"]) -> Float[Array, "samples points"]:
-        """Repeat the row of each light for its samples."""
-        if len(self.distinct) == len(self.light_indices):
-            return rows
-        return rows[jnp.asarray([self.distinct.index(index) for index in self.light_indices])]
-
-
-def lights_by_kind(
-    lights: tuple[AbstractLight, ...],
-) -> list[list[tuple[int, AbstractLightSample]]]:
-    """List the samples of each kind of lights, each with the index of its light. Lights with one
-    highlight for all samples are listed separately.
-    """
-    kinds: dict[object, list[tuple[int, AbstractLightSample]]] = {}
-    for index, light in enumerate(lights):
-        has_lobes = type(light).highlight is AbstractLight.highlight
-        for sample in light.samples():
-            kinds.setdefault((jax.tree.structure(sample), has_lobes), []).append((index, sample))
-    return list(kinds.values())
-
-
-def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
-    """Stack samples of equal kind, so that one loop computes any number of them."""
-    groups = []
-    for members in lights_by_kind(lights):
-        indices, samples = zip(*members, strict=True)
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *samples)
-        highlights = [lights[index].highlight() for index in dict.fromkeys(indices)]
-        groups.append(StackedLights(stacked, indices, tuple(filter(None, highlights))))
-    return groups

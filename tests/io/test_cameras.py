@@ -14,7 +14,6 @@ from bodies import unit
 from scipy.spatial.transform import Rotation
 from test_refusals import refused, write_any
 
-import splatjax as sj
 from splatjax.io import load_cameras, load_lights
 from splatjax.splatting import PerspectiveView
 
@@ -108,15 +107,18 @@ def test_cameras_of_gltf_have_its_projection(double, suffix):
 
 def test_lights_of_gltf_keep_what_a_surface_receives(double):
     """In lux: a directional light anywhere, others at a unit of length."""
-    with pytest.warns(UserWarning, match="'beamer' is a spot"):
-        sun, bulb, spot = load_lights(FILES / "stage.gltf", mm_per_unit=MM, lux=0.5)
+    sun, bulb, spot = load_lights(FILES / "stage.gltf", mm_per_unit=MM, lux=0.5)
     np.testing.assert_allclose(sun.irradiance, [1.5, 0.75, 0.375])
     np.testing.assert_allclose(unit(sun.direction), [0, 1, 0], atol=1e-9)
     place = np.asarray([0.1, 0.2, -0.3]) + Rotation.from_rotvec([0, np.pi / 4, 0]).apply([2, 4, 6])
     np.testing.assert_allclose(bulb.position, MM * place)
     _, received = bulb.incidence(bulb.position + jnp.asarray([0, -MM, 0]))
     np.testing.assert_allclose(received, [10, 9, 8])
-    assert isinstance(spot, sj.PointLight)
+    axis = Rotation.from_rotvec([0, np.pi / 4, 0]).apply([0, 0, -1])
+    np.testing.assert_allclose(unit(spot.direction), axis, atol=1e-9)
+    np.testing.assert_allclose([spot.inner_angle, spot.outer_angle], [0, np.degrees(0.5)])
+    _, received = spot.incidence(spot.position[None] + MM * jnp.asarray([axis, -axis]))
+    np.testing.assert_allclose(received, [[2.5] * 3, [0] * 3])
 
 
 FOV = "1 FOV 640 480 600.5 310.25 251.5 0.9\n7 PINHOLE 100 200 150 150 50 100\n"

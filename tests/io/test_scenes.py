@@ -46,6 +46,7 @@ def test_a_scene_comes_back_from_its_file_and_from_a_manifest(tmp_path):
     lights = (
         sj.DirectionalLight([1, -1, 0], [3, 2, 1], cast_shadows=False),
         sj.PointLight([50, 60, 70], [1e4, 2e4, 3e4]),
+        sj.scene.SpotLight([50, 60, 70], [0, 0, -1], [1e4, 2e4, 3e4], 10, 25),
         sj.GaussianBeam([0, 0, 90], [0, 0, -1], [5, 6, 7], 4.0),
         sj.scene.RectangleLight([90, 0, 0], [1, 2, 3], [[0, 9, 0], [0, 0, 9]], count=7),
         sj.scene.DiskLight([90, 0, 0], [1, 2, 3], [-1, 0, 0], 5.0),

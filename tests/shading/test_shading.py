@@ -283,6 +283,7 @@ def test_irradiance_is_the_sum_of_the_formulas(count, dtype):
             sj.GaussianBeam(ORIGIN, AXIS, STRENGTHS[3], 9.0),
             sj.PointLight(PLACE, STRENGTHS[2]),
             sj.DirectionalLight(DIRECTIONS[1], STRENGTHS[1]),
+            sj.scene.SpotLight(PLACE, -PLACE, STRENGTHS[2], 5, 15),
         )
     )
     rng, visible, shares = np.random.default_rng(0), [], {}
@@ -308,7 +309,22 @@ def test_irradiance_is_the_sum_of_the_formulas(count, dtype):
     point = received(unit(away)) / np.sum(away**2, axis=1)
     expected += np.outer(STRENGTHS[2], point * shares[2])
     expected += np.outer(STRENGTHS[1], received(-unit(DIRECTIONS[1])) * shares[3])
+    inner, outer = np.cos(np.radians([5, 15]))
+    t = np.clip((unit(away) @ unit(PLACE) - outer) / (inner - outer), 0, 1)
+    assert np.min(t) == 0
+    assert np.max(t) == 1
+    expected += np.outer(STRENGTHS[2], point * (3 * t**2 - 2 * t**3) * shares[4])
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_a_spot_has_its_derivatives(float64):
+    points = jnp.asarray(PLACE * [[0.3], [0.5]] + [[1, 0, 3], [-2, 1, 0]])
+
+    @jax.jit
+    def received(place, direction, inner, outer, points):
+        return sj.scene.SpotLight(place, direction, STRENGTHS[2], inner, outer).incidence(points)
+
+    check_grads(received, (jnp.asarray(PLACE), -jnp.asarray(PLACE), 3.0, 40.0, points), 2)
 
 
 EDGES = np.asarray([[3.0, 0, 0], [0, 2.0, 0]])
