@@ -3,6 +3,7 @@ and resolution by the splats.
 """
 
 import abc
+import itertools
 import math
 
 import equinox as eqx
@@ -29,8 +30,10 @@ _LEAST_TRUNCATED, _MOST_TRUNCATED = 4e-5, 0.1  # of the power: 4.5 and 2.1 stand
 _LEAST_SHARE = 1e-3  # of the diffusion integral in a layer that counts at all
 _UNEVEN = 0.05  # from which on splats count as scattered
 _SLACK = 1e-5
-_TINY_ENERGY = 1e-12  # left for the widest layers when their probability is not needed
-_ROUNDING = 0.05  # of the mass of a flat sheet: the corner of the gain is rounded over this excess
+_TINY_ENERGY = 1e-12  # below which an energy does not count
+_ROUNDING = 0.01  # of the mass of a flat sheet: the corner of the gain is rounded over this excess
+_LARGEST_DECAY = 3.0  # of a layer: the tiny weights that fits give to wider ones are not physical
+_SHALLOW = 0.25  # standard deviations: the depth of sources from which curvature can be inferred
 _SAMPLE = 64  # splats whose neighbors are measured to find how evenly all are spread
 
 
@@ -155,41 +158,61 @@ class PlainMean(AbstractDiffusionKernel):
 class EscapeNormalization(AbstractDiffusionKernel):
     r"""A kernel for which light escapes sooner from thin or convex parts, so that less is absorbed.
 
-    Light spreads from layer to layer, the narrow ones first. Of the light still inside, the
-    fraction `p_k = w_k / (W_k + 1 - W)` leaves a flat surface as layer k, where `W_k` is the energy
-    of the layers as wide or wider and `W` that of all layers and of single scattering, each times
-    the albedo. If the kernel mass on the surface is `S_k` times that of a flat sheet, the odds `p_k
-    / (1 - p_k)` are multiplied by `S_k`, and the wider layers share the rest:
+    Below a flat surface diffused light decays as `exp(-kappa z)`, and below one of mean curvature
+    H as if its rate were `kappa - H`, down to 0. The total reflectance of a sum of Gaussians at
+    another rate, for the same scattering, is `sum_k w_k exp(v_k (kappa^2 - rate^2) / 2)`. Each
+    layer is therefore multiplied by
 
-        gain_k = S_k / prod_(j <= k) (1 + p_j (S_j - 1))    where S > 1; S counts as 1 elsewhere
+        gain_k = exp(v_k (kappa H_k - H_k^2 / 2)),   H_k <= kappa
 
-    The gain is 1 on flat surfaces and at open edges. For non-negative weights with a sum of at most
-    one, no more light leaves than entered, `sum_k w_k gain_k <= 1`, and all of it leaves without
-    absorption (`W = 1`). Negative weights of an unconstrained fit count as zero. The corner at `S =
-    1` is rounded over 0.05.
+    The rate is that of a reflectance `1 / (1 + c kappa)`: `kappa^2 = (1 - W) / v`, where `W` is the
+    fraction of light that leaves a flat surface, and `v` the mean variance of the layers, weighted
+    by their energies. The curvature follows from the kernel mass `S_k` on the surface, times that
+    of a flat sheet: `H_k = (S_k - 1) / (depth sqrt(v_k))` is right on large spheres and cylinders;
+    of a sheet much thinner than the layer is wide `S_k` is 2. A layer too wide for its body uses
+    the greatest mass of the narrower ones.
+
+    The gain is 1 on flat surfaces, where S < 1 (open edges, concave parts), and without absorption.
+    For non-negative weights with a sum of at most one, no more light leaves than entered, `sum_k
+    w_k gain_k <= 1`. Negative weights of an unconstrained fit count as zero. The corner at `S = 1`
+    is rounded over 0.01.
 
     The source is below its splat, because the light that leaves has been inside. This makes a splat
     on the other side of a thin part nearer, and one across an air gap farther.
 
-    **Source:** fitted to path tracing: docs/bodies.md.
+    **Source:** the diffusion equation in a sphere, where the rate is `kappa coth(kappa R) - 1 / R`;
+    compared with path tracing in docs/bodies.md.
     """
 
     depth: float = eqx.field(static=True, default=0.75)
 
     def gain(self, mass, variances, energies, single_scattering_albedo):
         energies = jnp.where(energies >= 0, energies, 0.0)
-        absorbed = 1 - jnp.sum(energies, axis=0) - single_scattering_albedo
+        leaves = jnp.sum(energies, axis=0) + single_scattering_albedo
         # White is exact only to rounding, so its derivative must not be at a corner.
-        absorbed = jnp.where(absorbed >= -_SLACK, absorbed, 0.0)[None]
-        # Row k of `not_wider` marks the layers that are as narrow as layer k or narrower.
-        rank = jnp.argsort(jnp.argsort(variances))
-        not_wider = (rank[None] <= rank[:, None]).astype(mass.dtype)
-        inside = jnp.tensordot(not_wider.T, energies, 1) + absorbed
-        escape_probability = energies / jnp.where(inside > _TINY_ENERGY, inside, 1.0)
-        excess = jnp.maximum(mass - 1, 0)
+        absorbed = jnp.where(leaves <= 1 + _SLACK, 1 - leaves, 0.0)
+
+        # The decay rate in units of the layer's width, kappa sqrt(v), and its square.
+        variance = variances.reshape(-1, *[1] * (energies.ndim - 1))
+        mean_variance = jnp.sum(energies * variance, axis=0) / jnp.maximum(leaves, _TINY_ENERGY)
+        squared_rate = absorbed / jnp.where(mean_variance > 0, mean_variance, 1.0)
+        squared = jnp.minimum(squared_rate[None] * variance, _LARGEST_DECAY**2)
+        decay = jnp.sqrt(jnp.maximum(squared, _TINY_ENERGY))
+
+        # The curvature in the same unit, by the greatest mass of all layers not wider.
+        order = jnp.argsort(variances)
+        masses = itertools.accumulate(jnp.unstack(mass[order]), jnp.maximum)
+        excess = jnp.maximum(jnp.stack(list(masses))[jnp.argsort(order)] - 1, 0)
         excess = excess * excess / (excess + _ROUNDING)
-        stays = jnp.log(1 + escape_probability * excess)
-        return (1 + excess) * jnp.exp(-jnp.tensordot(not_wider, stays, 1))
+        curvature = excess / (1 + excess) / max(self.depth, _SHALLOW)
+
+        exponent = jnp.where(
+            curvature < decay, curvature * (decay - 0.5 * curvature), 0.5 * squared
+        )
+        grown = jnp.expm1(exponent)
+        # All layers together gain at most what a flat surface absorbs.
+        added = jnp.sum(energies * grown, axis=0) / jnp.maximum(absorbed, _TINY_ENERGY)
+        return 1 + grown * ((1 + added**4) ** -0.25)[None]
 
 
 def resolved_fraction(

@@ -48,6 +48,25 @@ THROUGH = {
 }
 
 
+# Path-traced by Mitsuba 3: radiance of spheres in even light over that of one of radius 400. Mean
+# free path 1, albedo 0.9, 0.98 and 0.998, eta 1.4; and the Gaussians of that medium.
+SPHERES = {
+    10.0: [1.238, 1.270, 1.185],
+    20.0: [1.114, 1.129, 1.132],
+    40.0: [1.060, 1.062, 1.071],
+}
+SPHERE_GAUSSIANS = np.asarray(
+    [
+        [0.0805, 0.08782, 0.09922, 0.10319],
+        [0.9814, 0.07519, 0.10586, 0.11242],
+        [4.5161, 0.07515, 0.15165, 0.18258],
+        [15.8463, 0.01959, 0.13114, 0.20317],
+        [57.9639, 0.0, 0.03031, 0.14982],
+        [254.0539, 0.0, 0.0, 0.05028],
+    ]
+)
+
+
 @eqx.filter_jit
 def gains(mass, weights, variances=VARIANCES, once=0.0, kernel=KERNEL):
     weights, variances = jnp.asarray(weights, float), jnp.asarray(variances, float)
@@ -139,21 +158,32 @@ def test_nothing_returns_more_than_it_receives_and_more_mass_lets_out_more():
         weights = rng.exponential(size=(6, 2))
         weights *= rng.uniform(0.1, 1, size=2) / weights.sum(0)
         assert np.all(returned(1 + 3 * rng.exponential(size=6), weights) <= 1 + 1e-5)
-    out = [returned(mass, WEIGHTS) for mass in (1.0, 1.5, 2.0)]
-    assert np.all(np.diff(out, axis=0) > 0.02)
-    wide_alone = gains(np.repeat([1.0, 2.0], 3), WEIGHTS)
-    assert np.all(gains(2.0, WEIGHTS)[3:] < wide_alone[3:]), "less is left for wider layers"
+    out = [returned(mass, WEIGHTS) for mass in (1.0, 1.2, 1.5)]
+    assert np.all(np.diff(out, axis=0) > 0.005)
+    assert np.all(np.diff(gains(2.0, WEIGHTS), axis=0) >= 0), "wide layers travel farthest"
     darker = gains(2.0, 0.5 * WEIGHTS)
     assert np.all(darker > gains(2.0, WEIGHTS)), "the darker gains more of what it would lose"
 
 
-def test_odds_of_leaving_grow_as_the_mass():
-    """For one Gaussian that is all there is: far above the rounded corner."""
-    weights = np.asarray([[0.3, 0.8]])
-    for mass in (40.0, 200.0):
-        leaving = returned(mass, weights, [1.0])
-        odds = mass * weights[0] / (1 - weights[0])
-        np.testing.assert_allclose(leaving / (1 - leaving), odds, rtol=0.05)
+def test_a_layer_wider_than_its_body_gains_as_the_narrower_ones():
+    ours, theirs = (gains([1, 1, 1, 1.2, 1.5, mass], WEIGHTS) for mass in (0.3, 1.5))
+    np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("radius", list(SPHERES))
+def test_spheres_return_what_walks_do(radius):
+    """Under even light, over what a flat surface returns."""
+    body = bodies.sphere(8000, radius)
+    sources = Sources(body.centers.T, body.normals.T, body.areas, jnp.ones((1, body.count)))
+    at_pole = jax.jit(
+        lambda *given: dense_layer(sources, jnp.asarray([[0.0], [0], [radius]]), *given)
+    )
+    variances, weights = SPHERE_GAUSSIANS[:, 0], SPHERE_GAUSSIANS[:, 1:]
+    layers = zip(variances, KERNEL.depths(jnp.asarray(variances, float)), strict=True)
+    mass = np.asarray([at_pole(*layer).values[-1, 0] for layer in layers])
+    mass = np.where(variances > 0.5 * float(body.areas[0]), mass, 1.0)
+    gained = returned(mass, weights, variances) / weights.sum(0)
+    np.testing.assert_allclose(gained, SPHERES[radius], rtol=0.08 if radius < 15 else 0.045)
 
 
 def test_layers_need_no_order_and_negative_weights_count_as_none():
@@ -179,7 +209,7 @@ def test_gradients_at_the_corners_are_the_limits():
     np.testing.assert_allclose(float(jax.grad(out)(zero)), slope, rtol=1e-2)
     of_mass = jax.grad(lambda mass: jnp.sum(gains(mass, WEIGHTS)))
     assert float(of_mass(1.0)) == 0
-    assert 0 < float(of_mass(1.001)) < 0.05 * float(of_mass(1.2))
+    assert 0 < float(of_mass(1.0001)) < 0.05 * float(of_mass(1.2))
     of_weights = jax.grad(lambda weights: jnp.sum(gains(2.0, weights)))
     almost = np.asarray([0.5, 0.5, 0.0, 0.0, 0.0, np.finfo(np.float32).tiny])[:, None]
     for weights in (np.zeros((6, 1)), np.eye(6)[:, :1], almost):
@@ -215,8 +245,8 @@ def test_sheets_let_through_what_walks_say(thickness):
         means, mass = np.where(resolved, means, 0.0), np.where(resolved, mass, 1.0)
         layers = means[:, None] * np.asarray(gains(mass, WEIGHTS, VARIANCES, 0.0, kernel))
         off.append(np.abs(np.sum(WEIGHTS * layers, axis=0) / truth - 1)[truth > 0.05])
-    assert np.all(off[0] < 0.35), off
-    assert np.all(off[0] < 0.6 * off[1]), off
+    assert np.all(off[0] < 0.25), off
+    assert np.all(off[0] < 0.35 * off[1]), off
 
 
 @pytest.mark.parametrize("interval", [(0.1, 0.2), (0.5, 3.0), (1.0, 5.0)])
