@@ -3,7 +3,6 @@ and resolution by the splats.
 """
 
 import abc
-import itertools
 import math
 
 import equinox as eqx
@@ -200,9 +199,9 @@ class EscapeNormalization(AbstractDiffusionKernel):
         decay = jnp.sqrt(jnp.maximum(squared, _TINY_ENERGY))
 
         # The curvature in the same unit, by the greatest mass of all layers not wider.
-        order = jnp.argsort(variances)
-        masses = itertools.accumulate(jnp.unstack(mass[order]), jnp.maximum)
-        excess = jnp.maximum(jnp.stack(list(masses))[jnp.argsort(order)] - 1, 0)
+        not_wider = variance[None] <= variance[:, None]
+        greatest = jnp.max(jnp.where(not_wider, mass[None], 1.0), axis=1)
+        excess = jnp.maximum(greatest - 1, 0)
         excess = excess * excess / (excess + _ROUNDING)
         curvature = excess / (1 + excess) / max(self.depth, _SHALLOW)
 
