@@ -26,13 +26,10 @@ from splatjax.geometry import Mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
 from splatjax.splatting import SplattingSettings
 
-SIZE = 128
-"""Pixels along a side."""
-SAMPLES, PASSES = 128, 4
-"""Paths per pixel of a pass, and passes."""
+SIZE = 128  # pixels along a side
+SAMPLES, PASSES = 128, 4  # paths per pixel of a pass, and passes
 ALBEDO = (0.9, 0.98, 0.998)
-SIGMA_T = 1.0
-"""1/mm; isotropic scattering."""
+SIGMA_T = 1.0  # 1/mm; isotropic scattering
 IRRADIANCE = float(np.pi)
 Place = tuple[float, float, float]
 
@@ -140,10 +137,8 @@ BODIES = [
         683_549,
     ),
 ]
+# Full coverage of splats spread as evenly as these: their discs then hardly exceed the outline.
 EVEN = 1.0
-"""Full coverage of splats as evenly spread as these, whose discs then hardly reach beyond the
-outline.
-"""
 
 PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"
 BEGIN, END = "<!-- table: tools/make_bodies.py -->", "<!-- end of table -->"
@@ -307,9 +302,10 @@ def main() -> None:
         truth, splats, pictures = read_truth(body, folder), splats_of(body), {}
         print(f"{body.name}: {np.sum(~truth.sound)} pixels of the truth left out", flush=True)
         for name, (material, settings) in models(body.eta).items():
-            what = "" if pictures else body.what  # once for all rows of a body
             pictures[name], seconds = splatted(body, splats, material, settings)
-            rows.append(row(what, name, truth, pictures[name], seconds))
+            rows.append(
+                row(body.what if len(pictures) == 1 else "", name, truth, pictures[name], seconds)
+            )
             print(rows[-1], flush=True)
         shown.append((truth, pictures))
         jax.clear_caches()  # the programs of all bodies are more than one process may hold

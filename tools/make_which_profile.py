@@ -21,8 +21,7 @@ BEGIN, END = "<!-- table: tools/make_which_profile.py -->", "<!-- end of table -
 ALBEDOS = np.array([0.5, 0.8, 0.95, 0.99, 0.998, 0.9998])
 INDICES = (1.0, 1.3, 1.5)
 THICKNESSES = (0.5, 1.0, 2.0, 4.0, 8.0)
-PLACES = (0.25, 1.0, 4.0, 16.0)
-"""Mean free paths, at which model over truth is given."""
+PLACES = (0.25, 1.0, 4.0, 16.0)  # mean free paths, at which model over truth is given
 
 RINGS = np.concatenate([[0.0], np.geomspace(0.1, 60.0, 65)])
 TITLES = ["medium", "true total", "model", "total off by", "E beyond 1"]

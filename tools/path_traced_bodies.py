@@ -28,7 +28,6 @@ def scene(mi, body: Body, mesh: Path, albedo=ALBEDO):
         "albedo": {"type": "rgb", "value": list(albedo)},
         "phase": {"type": "isotropic"},
     }
-    smooth = {"type": "dielectric", "int_ior": body.eta, "ext_ior": 1.0}
     view = transform().look_at(origin=list(body.eye), target=list(body.target), up=[0, 1, 0])
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     description = {
@@ -43,7 +42,9 @@ def scene(mi, body: Body, mesh: Path, albedo=ALBEDO):
             "type": "ply",
             "filename": str(mesh),
             "face_normals": body.eta == 1,
-            "bsdf": {"type": "null"} if body.eta == 1 else smooth,
+            "bsdf": {"type": "null"}
+            if body.eta == 1
+            else {"type": "dielectric", "int_ior": body.eta, "ext_ior": 1.0},
             "interior": medium,
         },
         "light": emitter(mi, body.light),
