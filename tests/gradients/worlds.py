@@ -75,6 +75,7 @@ def sun_and_beam() -> World:
     lights = (
         sj.DirectionalLight([-0.6, -0.4, -0.7], [2.0, 3.0], cast_shadows=False),
         sj.GaussianBeam([2.0, 3.0, 30.0], [-0.1, 0.1, -1.0], [400.0, 600.0], 20.0),
+        sj.scene.SpotLight([3.0, 9.0, 30.0], [0, -9, -30], [5e2, 9e2], 5, 25, cast_shadows=False),
     )
     camera = dataclasses.replace(view(), principal_point=jnp.asarray([0.47, 0.56]))
     return World(sj.Scene(_colored(bodies.bumpy(240)), lights, sj.Material(_gaussians())), camera)
