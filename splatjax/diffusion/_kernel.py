@@ -127,7 +127,7 @@ class AbstractDiffusionKernel(eqx.Module):
     def gain(
         self,
         mass: Float[Array, "gaussians #channels *points"],
-        variances: Float[Array, " gaussians"],
+        variances: Float[Array, "gaussians ..."],
         energies: Float[Array, "gaussians channels *points"],
         single_scattering_albedo: Float[Array, "channels *points"],
     ) -> Float[Array, "gaussians #channels *points"]:
@@ -137,7 +137,7 @@ class AbstractDiffusionKernel(eqx.Module):
 
         - `mass`: of the kernel on the surface, `sum_j A_j G(v_k, |x - q_j|)` over its value on a
           flat sheet: 1 there, 2 in a sheet much thinner than the layer is wide, less at open edges.
-        - `variances`: mm^2; only their order counts.
+        - `variances`: mm^2; those of each point, or of all.
         - `energies`: weights times the albedo at the point: the fraction of the light that leaves a
           flat surface as each layer.
         - `single_scattering_albedo`: the fraction that leaves as single scattering.
@@ -192,7 +192,8 @@ class EscapeNormalization(AbstractDiffusionKernel):
         absorbed = jnp.where(leaves <= 1 + _SLACK, 1 - leaves, 0.0)
 
         # The decay rate in units of the layer's width, kappa sqrt(v), and its square.
-        variance = variances.reshape(-1, *[1] * (energies.ndim - 1))
+        lacking = energies.ndim - variances.ndim
+        variance = variances.reshape(*variances.shape, *[1] * lacking)
         mean_variance = jnp.sum(energies * variance, axis=0) / jnp.maximum(leaves, _TINY_ENERGY)
         squared_rate = absorbed / jnp.where(mean_variance > 0, mean_variance, 1.0)
         squared = jnp.minimum(squared_rate[None] * variance, _LARGEST_DECAY**2)

@@ -213,7 +213,7 @@ class LayersAtPoints(eqx.Module):
         # Splats that do not resolve a layer do not determine its mass either.
         gain = self.kernel.gain(
             1 + resolved * (mass - 1),
-            self.variances,
+            variances,
             weights * self.albedo[None],
             single_scattering_albedo[:, None] * self.albedo,
         )
