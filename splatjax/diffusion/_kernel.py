@@ -166,10 +166,10 @@ class EscapeNormalization(AbstractDiffusionKernel):
 
     The rate is that of a reflectance `1 / (1 + c kappa)`: `kappa^2 = (1 - W) / v`, where `W` is the
     fraction of light that leaves a flat surface, and `v` the mean variance of the layers, weighted
-    by their energies. The curvature follows from the kernel mass `S_k` on the surface, times that
-    of a flat sheet: `H_k = (S_k - 1) / (depth sqrt(v_k))` is right on large spheres and cylinders;
-    of a sheet much thinner than the layer is wide `S_k` is 2. A layer too wide for its body uses
-    the greatest mass of the narrower ones.
+    by their energies. The curvature follows from `S_k`, the kernel mass on the surface over that of
+    a flat sheet: `H_k = (1 - 1 / S_k) / (depth sqrt(v_k))`, which is exact on spheres that are
+    large against the layer. On a sheet much thinner than the layer is wide `S_k` is 2. A layer too
+    wide for its body uses the greatest mass of the narrower ones.
 
     The gain is 1 on flat surfaces, where S < 1 (open edges, concave parts), and without absorption.
     For non-negative weights with a sum of at most one, no more light leaves than entered, `sum_k
