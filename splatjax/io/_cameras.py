@@ -1,6 +1,7 @@
 """Cameras of files: transforms.json of NeRF and instant-ngp, COLMAP, and glTF."""
 
 import json
+import struct
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -16,7 +17,9 @@ from ._files import StrPath, check_units, existing_file, with_y_up
 from ._trimesh import one_sentence
 
 _Pose: TypeAlias = Float[np.ndarray, "4 4"]
-_Found: TypeAlias = Iterator[tuple[str, Mapping[str, Any], _Pose]]
+_Lens: TypeAlias = Mapping[str, Any]
+_Found: TypeAlias = Iterator[tuple[str, _Lens, _Pose]]
+_Image: TypeAlias = tuple[str, int, list[float]]  # name, camera, quaternion and translation
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
 _SQUARE = 1e-2  # pixels, at the edge of a picture, by which focal lengths may differ
 _ROWS = 512  # of a picture, whose size glTF does not specify
@@ -38,7 +41,7 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
     | file | cameras |
     | --- | --- |
     | `transforms.json` | of NeRF, instant-ngp and nerfstudio, by `file_path` |
-    | a folder of COLMAP | `cameras.txt` and `images.txt`, by the names of images |
+    | a folder of COLMAP | `cameras` and `images`, `.txt` or `.bin`, by the names of images |
     | `.gltf`, `.glb` | perspective cameras, by the names of their nodes; 512 rows |
 
     **Arguments:**
@@ -87,9 +90,7 @@ def resized(camera: Camera, height: int) -> Camera:
     return replace(camera, width=width, height=height)
 
 
-def _camera(
-    where: str, lens: Mapping[str, Any], pose: _Pose, mm_per_unit: float, up: str
-) -> Camera:
+def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -> Camera:
     """Make a camera of a lens and a pose: camera to world, from right, down and forward.
 
     The lens has the entries of instant-ngp: w, h, fl_x, fl_y, cx and cy, in pixels; the last three
@@ -98,10 +99,7 @@ def _camera(
     model = lens.get("camera_model", "PINHOLE")
     bent = [f"{name} = {lens[name]}" for name in _DISTORTION if lens.get(name)]
     if bent or model not in _MODELS:
-        raise ValueError(
-            f"{where}: its lens is {', '.join([model, *bent])}, with distortion; undistort the "
-            "pictures first, such as by `colmap image_undistorter`"
-        )
+        raise _has_distortion(where, ", ".join([model, *bent]))
     if not lens.keys() >= {"w", "h", "fl_x"}:
         raise ValueError(f"{where}: has only {', '.join(lens)}; add w, h and fl_x, in pixels")
     width, height, focal_x = int(lens["w"]), int(lens["h"]), lens["fl_x"]
@@ -122,6 +120,11 @@ def _camera(
     return Camera(mm_per_unit * place, axes, *shown, principal_point=middle)
 
 
+def _has_distortion(where: str | Path, lens: str) -> ValueError:
+    remedy = "undistort the pictures first, such as by `colmap image_undistorter`"
+    return ValueError(f"{where}: its lens is {lens}, with distortion; {remedy}")
+
+
 def _transforms(path: Path) -> _Found:
     content = json.loads(path.read_text(encoding="utf-8"))
     for index, frame in enumerate(content["frames"]):
@@ -135,19 +138,46 @@ def _transforms(path: Path) -> _Found:
 def _colmap(path: Path) -> _Found:
     from trimesh.transformations import quaternion_matrix  # takes a second
 
-    if (path / "images.bin").exists() and not (path / "images.txt").exists():
-        convert = "convert it by `colmap model_converter --output_type TXT`"
-        raise ValueError(f"{path}: is a binary model; {convert}")
-    lenses = {}
+    is_binary = (path / "images.bin").exists() and not (path / "images.txt").exists()
+    lenses, images = (_colmap_binary if is_binary else _colmap_text)(path)
+    for name, camera, pose in images:
+        to_camera = quaternion_matrix(pose[:4])
+        to_camera[:3, 3] = pose[4:]
+        yield name, lenses[camera], np.linalg.inv(to_camera)
+
+
+def _colmap_text(path: Path) -> tuple[dict[int, _Lens], list[_Image]]:
+    lenses, images = {}, []
     for line in _lines(path / "cameras.txt"):
         number, model, width, height, *values = line.split()
         parameters = zip(_MODELS.get(model, ()), map(float, values), strict=False)
-        lenses[number] = {"camera_model": model, "w": width, "h": height, **dict(parameters)}
+        lenses[int(number)] = {"camera_model": model, "w": width, "h": height, **dict(parameters)}
     for line in _lines(path / "images.txt")[::2]:  # between them, the points of each
         _, *pose, camera, name = line.split(maxsplit=9)
-        to_camera = quaternion_matrix([*map(float, pose[:4])])
-        to_camera[:3, 3] = pose[4:]
-        yield name, lenses[camera], np.linalg.inv(to_camera)
+        images.append((name, int(camera), [*map(float, pose)]))
+    return lenses, images
+
+
+def _colmap_binary(path: Path) -> tuple[dict[int, _Lens], list[_Image]]:
+    lenses, images, models = {}, [], [*_MODELS]  # in the order of COLMAP's numbers
+    data, at = existing_file(path / "cameras.bin").read_bytes(), 8
+    for _ in range(*struct.unpack_from("<Q", data)):
+        number, model, width, height = struct.unpack_from("<iiQQ", data, at)
+        if model >= len(models):
+            raise _has_distortion(path / "cameras.bin", f"COLMAP's model {model}")
+        names = _MODELS[models[model]]
+        values = struct.unpack_from(f"<{len(names)}d", data, at + 24)
+        lenses[number] = {"camera_model": models[model], "w": width, "h": height}
+        lenses[number] |= zip(names, values, strict=True)
+        at += 24 + 8 * len(names)
+    data, at = (path / "images.bin").read_bytes(), 8
+    for _ in range(*struct.unpack_from("<Q", data)):
+        _, *pose, camera = struct.unpack_from("<i7di", data, at)
+        end = data.index(b"\0", at + 64)
+        images.append((data[at + 64 : end].decode(), camera, pose))
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9 + 24 * points
+    return lenses, images
 
 
 def _lines(path: Path) -> list[str]:

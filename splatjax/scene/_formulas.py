@@ -191,7 +191,8 @@ def sun_and_sky(
     to_sun = jnp.tensordot(directions, _frame(azimuth, elevation)[2], 1)[..., None] - 1
     rise = jnp.sqrt(jnp.maximum(directions[..., 1:2], 1e-4))
     sky = horizon + (zenith - horizon) * rise + 0.5 * horizon * jnp.exp(6 * to_sun)
-    disk = jnp.exp(_CONCENTRATION * (to_sun - jnp.max(to_sun)))
+    nearest = jax.lax.stop_gradient(jnp.max(to_sun))  # cancels in the normalized disk
+    disk = jnp.exp(_CONCENTRATION * (to_sun - nearest))
     disk = disk / jnp.sum(disk * solid_angles[..., None])
     disk = jnp.where(as_floats(elevation) > 0, disk, 0.0)
     return jnp.where(directions[..., 1:2] > 0, sky, 0.12) + disk * sun

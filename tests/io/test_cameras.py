@@ -64,14 +64,15 @@ def transforms(tmp_path):
     return write
 
 
-def test_cameras_of_colmap_show_what_colmap_shows(double):
-    cameras = load_cameras(FILES / "colmap", mm_per_unit=MM)
+@pytest.mark.parametrize("folder", ["colmap", "colmap_binary"])
+def test_cameras_of_colmap_show_what_colmap_shows(double, folder):
+    cameras = load_cameras(FILES / folder, mm_per_unit=MM)
     assert list(cameras) == list(COLMAP)
     for name, expected in COLMAP.items():
         np.testing.assert_allclose(pixels(cameras[name], POINTS), expected, atol=PIXELS)
     tall = cameras["tall.png"]
     assert (tall.width, tall.height, tall.principal_point) == (100, 200, None)
-    turned = load_cameras(FILES / "colmap", mm_per_unit=MM, up="z")["left 1.png"]
+    turned = load_cameras(FILES / folder, mm_per_unit=MM, up="z")["left 1.png"]
     upright = POINTS[:, [0, 2, 1]] * [1, 1, -1]
     np.testing.assert_allclose(pixels(turned, upright), COLMAP["left 1.png"], atol=PIXELS)
 
@@ -164,5 +165,15 @@ def test_files_without_cameras(tmp_path, name, text, value):
 def test_a_lens_of_colmap_with_distortion(tmp_path):
     shutil.copy(FILES / "colmap" / "images.txt", tmp_path)
     refused(write_any(tmp_path / "cameras.txt", FOV), "FOV", lambda path: in_mm(path.parent))
-    (tmp_path / "images.txt").rename(tmp_path / "images.bin")
-    refused(tmp_path / "images.bin", "--output_type TXT", lambda path: in_mm(path.parent))
+    folder = shutil.copytree(FILES / "colmap_binary", tmp_path / "binary")
+    data = bytearray((folder / "cameras.bin").read_bytes())
+    data[12] = 5  # OPENCV_FISHEYE
+    (folder / "cameras.bin").write_bytes(data)
+    refused(folder / "cameras.bin", "model 5", lambda path: in_mm(path.parent))
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
+def test_a_truncated_file_of_colmap(tmp_path, name):
+    folder = shutil.copytree(FILES / "colmap_binary", tmp_path / "binary")
+    (folder / name).write_bytes((folder / name).read_bytes()[:-5])
+    refused(folder, "truncated", in_mm)
