@@ -30,7 +30,6 @@ _LEAST_SHARE = 1e-3  # of the diffusion integral in a layer that counts at all
 _UNEVEN = 0.05  # from which on splats count as scattered
 _SLACK = 1e-5
 _TINY_ENERGY = 1e-12  # below which an energy does not count
-_DARK = 1e-9  # the energy below which a point counts as black
 _ROUNDING = 0.01  # of the mass of a flat sheet: the corner of the gain is rounded over this excess
 _LARGEST_DECAY = 3.0  # of a layer: the tiny weights that fits give to wider ones are not physical
 _SHALLOW = 0.25  # standard deviations: the depth of sources from which curvature can be inferred
@@ -195,9 +194,8 @@ class EscapeNormalization(AbstractDiffusionKernel):
         # The decay rate in units of the layer's width, kappa sqrt(v), and its square.
         lacking = energies.ndim - variances.ndim
         variance = variances.reshape(*variances.shape, *[1] * lacking)
-        widest = jax.lax.stop_gradient(jnp.max(variance, axis=0))  # that of black
-        leaving = jnp.sum(energies * variance, axis=0) + _DARK * widest
-        squared_rate = absorbed * (leaves + _DARK) / jnp.where(leaving > 0, leaving, 1.0)
+        mean_variance = jnp.sum(energies * variance, axis=0) / jnp.maximum(leaves, _TINY_ENERGY)
+        squared_rate = absorbed / jnp.where(mean_variance > 0, mean_variance, 1.0)
         squared = jnp.minimum(squared_rate[None] * variance, _LARGEST_DECAY**2)
         decay = jnp.sqrt(jnp.maximum(squared, _TINY_ENERGY))
 

@@ -25,7 +25,7 @@ _SQUARE = 1e-2  # pixels, at the edge of a picture, by which focal lengths may d
 _ROWS = 512  # of a picture, whose size glTF does not specify
 _LIGHTS = "KHR_lights_punctual"
 _SHEAR = 1e-3  # relative difference of the scales of axes
-# Models of COLMAP with their parameters; others have distortion.
+# Models of COLMAP with their parameters, in the order of its numbers; others have distortion.
 _MODELS = {
     "SIMPLE_PINHOLE": ("fl_x", "cx", "cy"),
     "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
@@ -159,11 +159,11 @@ def _colmap_text(path: Path) -> tuple[dict[int, _Lens], list[_Image]]:
 
 
 def _colmap_binary(path: Path) -> tuple[dict[int, _Lens], list[_Image]]:
-    lenses, images, models = {}, [], [*_MODELS]  # in the order of COLMAP's numbers
+    lenses, images, models = {}, [], [*_MODELS]
     data, at = existing_file(path / "cameras.bin").read_bytes(), 8
     for _ in range(*struct.unpack_from("<Q", data)):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
-        if model >= len(models):
+        if not 0 <= model < len(models):
             raise _has_distortion(path / "cameras.bin", f"COLMAP's model {model}")
         names = _MODELS[models[model]]
         values = struct.unpack_from(f"<{len(names)}d", data, at + 24)
