@@ -60,10 +60,10 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
         splats = splats.take(plan.raster.choose(splats, view)[0])
         rows = jnp.concatenate([splats.normals.T, splats.albedo.T])
         seen = splatting.visible_surfaces(
-            splats, rows, view, settings.splatting, plan.raster, DeviceMesh()
+            splats, rows, view, plan.splatting, plan.raster, DeviceMesh()
         )
         attributes = splatting.Surface.of(seen.sums, view, seen.needed).attributes
-        return seen.picture(attributes), seen.picture(jnp.ones_like(seen.before))
+        return seen.picture(attributes), seen.picture(jnp.ones_like(seen.share))
 
     def loss(*inputs):
         attributes, coverage = picture(*inputs)

@@ -23,7 +23,7 @@ from splatjax.splatting import (
     Surface,
     TileGrid,
     TileRasterizer,
-    coverage,
+    VisibleSurfaces,
 )
 
 SHADOWS = ShadowSettings(resolution=32)
@@ -233,8 +233,8 @@ def drawn(
     """Draw both surfaces; where there is none all is 0, but the depth 1."""
     sums = plan.sum_fragments(body, rows, view, settings, DeviceMesh())
     grid, surface = TileGrid(view.width, view.height), Surface.of(sums.sums, view, sums.needed)
-    weights = sums.sums.weights
-    planes = jnp.stack([surface.depth - 1, weights, coverage(weights, settings.full_coverage)], 1)
+    share = VisibleSurfaces.of(sums, view, settings, DeviceMesh()).share
+    planes = jnp.stack([surface.depth - 1, sums.sums.weights, share], 1)
     planes = jnp.concatenate([surface.attributes, planes], axis=1)
 
     def join(places: slice) -> Pictures:

@@ -24,7 +24,6 @@ import splatjax as sj
 from splatjax.diffusion import PlainMean, ShapeDiffuser
 from splatjax.geometry import Mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
-from splatjax.splatting import SplattingSettings
 
 SIZE = 128  # pixels along a side
 SAMPLES, PASSES = 128, 4  # paths per pixel of a pass, and passes
@@ -137,8 +136,6 @@ BODIES = [
         683_549,
     ),
 ]
-# Full coverage of splats spread as evenly as these: their discs then hardly exceed the outline.
-EVEN = 1.0
 
 PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"
 BEGIN, END = "<!-- table: tools/make_bodies.py -->", "<!-- end of table -->"
@@ -193,16 +190,16 @@ def models(eta: float) -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
         single_scattering=single,
         angles=half_space.angular_law(apart),
     )
-    even = sj.RenderSettings(SplattingSettings(full_coverage=EVEN))
+    plain = sj.RenderSettings()
     return {
-        "the paper's mean": (flat, dataclasses.replace(even, kernel=PlainMean())),
-        "escape normalization and angles": (whole, even),
-        "and single scattering": (parted, even),
-        "and a bounce": (parted, dataclasses.replace(even, bounces=1)),
-        "the diffusion equation": (solved, dataclasses.replace(even, diffuser=ShapeDiffuser())),
+        "the paper's mean": (flat, dataclasses.replace(plain, kernel=PlainMean())),
+        "escape normalization and angles": (whole, plain),
+        "and single scattering": (parted, plain),
+        "and a bounce": (parted, dataclasses.replace(plain, bounces=1)),
+        "the diffusion equation": (solved, dataclasses.replace(plain, diffuser=ShapeDiffuser())),
         "the same and a bounce": (
             solved,
-            dataclasses.replace(even, diffuser=ShapeDiffuser(), bounces=1),
+            dataclasses.replace(plain, diffuser=ShapeDiffuser(), bounces=1),
         ),
     }
 

@@ -241,7 +241,7 @@ class Passes(eqx.Module):
             added_source=light.added_source,
         )
         visible = _splatting.visible_surfaces(
-            splats, stack_rows(attributes), view, settings.splatting, plan.raster, self.combination
+            splats, stack_rows(attributes), view, plan.splatting, plan.raster, self.combination
         )
 
         needed = self.combination.largest([jnp.maximum(chosen_needed, light.needed)])

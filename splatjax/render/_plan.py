@@ -52,6 +52,7 @@ class Plan(eqx.Module):
       lights without shadows.
     - `diffusion`: the clusters and neighbors of the splats.
     - `interval`: standard deviations per spacing between which a layer becomes resolved.
+    - `splatting`: the settings of passes 2 and 3, with the coverage of these splats.
     - `raster`: the capacity for the views of the cameras.
     - `sightlines`: the visibility between splats; `None` without bounces.
     - `mesh`: the devices of the splats; `None` for one. Static.
@@ -63,6 +64,7 @@ class Plan(eqx.Module):
     shadows: tuple[ShadowPlan | None, ...]
     diffusion: _diffusion.AbstractDiffusionPlan
     interval: Float[Array, "2"]
+    splatting: _splatting.SplattingSettings
     raster: _splatting.AbstractRasterPlan
     sightlines: _splatting.Sightlines | None
     mesh: Mesh | None = eqx.field(static=True)
@@ -113,7 +115,7 @@ def make_plan(
     scene, other_scenes, cameras = in_one_dtype(scene, other_scenes, cameras)
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
     parts, order, exists = _cut_and_order(scene.splats, mesh)
-    bounds, interval = _measure(parts, settings.kernel)
+    bounds, interval, splatting = _measure(parts, settings)
     gaussians = scene.material.gaussians
     variances = pad_gaussians(gaussians).variances
     raster = settings.rasterizer.make_plan(parts, views, settings.splatting)
@@ -126,6 +128,7 @@ def make_plan(
         ),
         diffusion=settings.diffuser.make_plan(parts, variances, settings.kernel, interval),
         interval=interval,
+        splatting=splatting,
         raster=raster.fitted(parts, views, settings.splatting),
         sightlines=_splatting.Sightlines.build(parts, settings.sightlines)
         if settings.bounces
@@ -281,11 +284,16 @@ def arrange(
 
 
 @eqx.filter_jit
-def _measure(parts: Sequence[Splats], kernel: _diffusion.AbstractDiffusionKernel):
-    """Compute the bounds of the splats, and the least width of a layer that they resolve."""
+def _measure(parts: Sequence[Splats], settings: RenderSettings):
+    """Compute the bounds of the splats, the least width of a layer that they resolve, and the
+    weight sum from which on they cover a pixel.
+    """
     splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    interval = kernel.interval(_diffusion.unevenness(splats))
-    return _splatting.Bounds.of(splats, DeviceMesh()), interval
+    uneven, area = _diffusion.unevenness(splats), jnp.sum(splats.areas)
+    square = jnp.sum(jnp.where(splats.areas > 0, splats.radii**2, 0.0))
+    discs = jnp.where(area > 0, square / jnp.where(area > 0, area, 1.0), 1.0)
+    bounds = _splatting.Bounds.of(splats, DeviceMesh())
+    return bounds, settings.kernel.interval(uneven), settings.splatting.measured(uneven, discs)
 
 
 def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[AbstractLightSample]]:

@@ -57,6 +57,7 @@ class StreamStatistics:
       rim.
     - `spacing`, `fine`: root of the mean area of the splats that have one, and the area that one in
       a hundred of these is finer than; infinite where none has.
+    - `discs`: the sum of the squared radii of these splats over that of their areas.
     - `unevenness`: the mean of the unevenness of the parts, weighted by their splats.
     """
 
@@ -65,6 +66,7 @@ class StreamStatistics:
     reach: float
     spacing: float
     fine: float
+    discs: float
     unevenness: float
 
     @classmethod
@@ -75,7 +77,7 @@ class StreamStatistics:
         smaller and not the last.
         """
         # Sizes, extent and areas.
-        sizes, low, high, area, count, radius = [], [], [], 0.0, 0, 0.0
+        sizes, low, high, area, square, count, radius = [], [], [], 0.0, 0.0, 0, 0.0
         for part in filter(lambda part: part.count, parts()):
             axes, areas = np.asarray(part.centers).T, np.asarray(part.areas)
             sizes.append(part.count)
@@ -83,7 +85,9 @@ class StreamStatistics:
             low.append([axis.min() for axis in axes])  # quicker than over an axis of three
             high.append([axis.max() for axis in axes])
             area += float(areas.sum(dtype=np.float64))
-            radius = max(radius, float(part.radii.max()))
+            radii = np.asarray(part.radii)
+            square += float(np.sum(radii**2, where=areas > 0, dtype=np.float64))
+            radius = max(radius, float(radii.max()))
         if not sizes:
             raise ValueError("parts has no splats; give at least one")
         if any(size != sizes[0] for size in sizes[:-1]) or sizes[-1] > sizes[0]:
@@ -106,5 +110,6 @@ class StreamStatistics:
             reach=math.sqrt(farthest) + radius,
             spacing=math.sqrt(area / count) if count else math.inf,
             fine=float(np.interp(rank, np.arange(len(finest)), finest)) if count else math.inf,
+            discs=square / area if area else 1.0,
             unevenness=uneven / max(count, 1),
         )

@@ -118,6 +118,9 @@ def render_streamed(
     dtype, view = first.splats.centers.dtype, _splatting.PerspectiveView.of(camera)
     middle, reach = (jnp.asarray(bound, dtype) for bound in (statistics.middle, statistics.reach))
     bounds = _splatting.Bounds(middle, reach)
+    uneven = jnp.asarray(statistics.unevenness, dtype)
+    splatting = settings.splatting.measured(uneven, jnp.asarray(statistics.discs, dtype))
+    settings = dataclasses.replace(settings, splatting=splatting)
 
     # Pass 1: the shadow maps of each light that casts shadows, in its group.
     def views_of(samples: list[AbstractLightSample]):
@@ -138,11 +141,11 @@ def render_streamed(
         part_size,
         views,
         rasterizer,
-        settings.splatting,
+        splatting,
         lambda scene: jnp.zeros((0, scene.splats.count), dtype),
     )
     shadow_maps = structure.unflatten(
-        _splatting.ShadowMap.of(of_view, seen_from, settings.splatting)
+        _splatting.ShadowMap.of(of_view, seen_from)
         for of_view, seen_from in zip(sums, views, strict=True)
     )
     light = partial(_light, groups=groups, shadow_maps=shadow_maps, settings=settings)
@@ -156,13 +159,13 @@ def render_streamed(
         part_size,
         [view],
         rasterizer,
-        settings.splatting,
+        splatting,
         lambda scene: stack_rows(settings.lighting.attributes(scene, *light(scene), view.position)),
     )
     visible, samples = _sample(seen, view, settings, like, bounds.center)
 
     # Pass 4, at the visible points.
-    interval = settings.kernel.interval(jnp.asarray(statistics.unevenness, dtype))
+    interval = settings.kernel.interval(uneven)
     diffusion = _diffusion.StreamedDiffusion(
         diffuser,
         settings.kernel,

@@ -69,7 +69,6 @@ class Sweep(eqx.Module):
 
     view_class: type[AbstractView] = eqx.field(static=True)
     grid: TileGrid
-    full_coverage: float = eqx.field(static=True)
     filter_radius: float = eqx.field(static=True)
 
     def within_picture(self, sums: PixelSums, tiles: Int[Array, " lanes"]) -> PixelSums:

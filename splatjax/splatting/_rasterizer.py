@@ -67,7 +67,14 @@ def fast_fragment_weight(squared_radius: Float[Array, "..."]) -> Float[Array, ".
     return root * root
 
 
-def coverage(weight_sum: Float[Array, "..."], full: float) -> Float[Array, "..."]:
+# The weight sum that covers a pixel inside a surface. Splats whose radius is 1.5 times the root of
+# their area, scattered at random, have at least 0.2 inside a closed surface.
+CLOSED = 0.15
+
+
+def coverage(
+    weight_sum: Float[Array, "..."], full: float | Float[Array, "..."] = CLOSED
+) -> Float[Array, "..."]:
     """Compute the fraction of a pixel that a surface covers: a smooth step of the sum of its
     weights, 1 from `full` on.
     """

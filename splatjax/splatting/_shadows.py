@@ -16,13 +16,13 @@ from splatjax.scene import Splats, rotation_towards
 from ._grid import TILE_SIDE, TileGrid
 from ._groups import MERGED_COUNTS
 from ._projections import OrthographicView, PerspectiveView
-from ._rasterizer import AbstractRasterPlan, FragmentSums, coverage, invalid_factor
+from ._rasterizer import CLOSED, AbstractRasterPlan, FragmentSums, coverage, invalid_factor
 from ._surfaces import Surface
 from ._views import AbstractView, SplattingSettings
 
-# Factor on the weight sum of full coverage in pictures. Discs extend beyond an open edge; a larger
-# sum makes its shadow extend less. Evenly spread splats always exceed a sum of 1.
-_LESS_COVERED = 2.0
+# The weight sum that covers a pixel of a map. Discs extend beyond an open edge; a larger sum than
+# in pictures makes its shadow extend less. Evenly spread splats always exceed a sum of 1.
+_COVERED = 2 * CLOSED
 _LEAST_RESOLUTION = 64
 _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 
@@ -197,16 +197,10 @@ class ShadowMap(eqx.Module):
     splats_per_disc: int = eqx.field(static=True, default=1)
 
     @classmethod
-    def of(
-        cls,
-        sums: FragmentSums,
-        view: AbstractView,
-        settings: SplattingSettings,
-        splats_per_disc: int = 1,
-    ) -> "ShadowMap":
+    def of(cls, sums: FragmentSums, view: AbstractView, splats_per_disc: int = 1) -> "ShadowMap":
         """Blend the sums of all parts."""
         surface = Surface.of(sums.sums, view, sums.needed)
-        covered = coverage(sums.sums.weights, min(_LESS_COVERED * settings.full_coverage, 1.0))
+        covered = coverage(sums.sums.weights, _COVERED)
         of_places = jnp.stack([surface.depth, covered])
         empty = jnp.zeros((2, TileGrid(view.width, view.height).count, TILE_SIDE**2), covered.dtype)
         planes = [
@@ -238,7 +232,7 @@ def make_shadow_map(
     needed = combination.largest([jnp.maximum(needed, sums.needed)])
     total = combination.total([sums.sums])
     sums = eqx.tree_at(lambda sums: (sums.sums, sums.needed), sums, (total, needed))
-    return ShadowMap.of(sums, view, splatting, splats_per_disc)
+    return ShadowMap.of(sums, view, splats_per_disc)
 
 
 def _spline(away: Float[Array, "pixels ..."]) -> Float[Array, "pixels ..."]:

@@ -3,6 +3,7 @@ attributes (Eq. 1).
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
@@ -12,10 +13,19 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
 from ._grid import TILE_SIDE, TileGrid
-from ._rasterizer import AbstractRasterPlan, FragmentSums, PixelSums, coverage, invalid_factor
+from ._rasterizer import (
+    CLOSED,
+    AbstractRasterPlan,
+    FragmentSums,
+    PixelSums,
+    coverage,
+    invalid_factor,
+)
 from ._views import AbstractView, SplattingSettings
 
 TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2  # of a chunk, for what is computed chunk by chunk
+_BESIDE = 2  # pixels from an open one: as far as outlines are filtered
+_TINY = 1e-8
 
 
 def blend_fragments(
@@ -30,6 +40,34 @@ def blend_fragments(
     """
     exists = weights != 0  # they are never negative, and NaN must stay
     return sums * jnp.where(exists, 1 / jnp.where(exists, weights, 1.0), 0.0)
+
+
+def coverages(
+    front: Float[Array, "tiles pixels"],
+    behind: Float[Array, "tiles pixels"],
+    grid: TileGrid,
+    full: float | Float[Array, ""],
+) -> tuple[Float[Array, "tiles pixels"], Float[Array, "tiles pixels"]]:
+    r"""Compute the fraction of each pixel that the front surface covers, and the one behind it.
+
+    Both together cover a smooth step of the sum of their weights. Beside the background, which is
+    within two pixels of one that they leave open, it ends at `full`, so that outlines are where the
+    body ends. Elsewhere it ends at a sum that surfaces keep in creases, and between splats
+    scattered at random. The front covers a smooth step of its own sum up to `full`, or all if
+    nothing is behind it.
+
+    **Arguments:** `front`, `behind`: sums of weights. Differentiable.
+    """
+    of_front, of_behind = coverage(front), coverage(behind)
+    is_open = grid.join(((1 - of_front) * (1 - of_behind))[:, None])
+    window = 1, 2 * _BESIDE + 1, 2 * _BESIDE + 1
+    beside = jax.lax.reduce_window(is_open, -jnp.inf, jax.lax.max, window, (1, 1, 1), "SAME")
+    both = coverage(front + behind, CLOSED + grid.cut(beside)[:, 0] * (full - CLOSED))
+    of_front = coverage(front, full)
+    total = of_front + (1 - of_front) * of_behind
+    exists = total > _TINY
+    of_front = both * jnp.where(exists, of_front / jnp.where(exists, total, 1.0), 1.0)
+    return of_front, both - of_front
 
 
 class Surface(eqx.Module):
@@ -65,7 +103,7 @@ class VisibleSurfaces(eqx.Module):
     - `tiles`: the tile of each place of this device; the number of tiles in an empty place.
     - `in_front`: whether a place belongs to the surface in front, or to the one behind.
     - `sums`: of the fragments.
-    - `before`: the coverage in front of the surface behind; 0 for the front.
+    - `share`: the fraction of its pixel that each surface covers.
     - `needed`: capacity needed over planned. Above 1 every picture is NaN, and so are its
       derivatives.
     """
@@ -74,9 +112,8 @@ class VisibleSurfaces(eqx.Module):
     tiles: Int[Array, " places"]
     in_front: Bool[Array, " places"]
     sums: PixelSums
-    before: Float[Array, "places pixels"]
+    share: Float[Array, "places pixels"]
     needed: Float[Array, ""]
-    full_coverage: float = eqx.field(static=True)
 
     @classmethod
     def of(
@@ -87,23 +124,23 @@ class VisibleSurfaces(eqx.Module):
         combination: AbstractCombination,
     ) -> "VisibleSurfaces":
         """Combine the sums of all devices; each keeps a share of the places."""
-        count = TileGrid(view.width, view.height).count
+        grid = TileGrid(view.width, view.height)
         in_front = jnp.arange(len(sums.tiles)) < sums.front
-        share, tiles = combination.own_share(sums.sums), combination.own_rows(sums.tiles)
-        # The coverage of the front, gathered from all devices.
-        covered = coverage(combination.gather(share.weights), settings.full_coverage)
-        front = jnp.zeros((count, TILE_SIDE**2), covered.dtype)
-        front = front.at[sums.tiles[: sums.front]].set(covered[: sums.front], mode="drop")
-        own_front = combination.own_rows(in_front)
-        before = front.at[tiles].get(mode="fill", fill_value=0)
+        own = combination.own_share(sums.sums)
+        # The weights of both surfaces in all tiles, gathered from all devices.
+        weights = combination.gather(own.weights)
+        of_tiles = jnp.zeros((2, grid.count, TILE_SIDE**2), weights.dtype)
+        surface = 1 - in_front.astype(jnp.int32)
+        of_tiles = of_tiles.at[surface, sums.tiles].set(weights, mode="drop")
+        shares = jnp.stack(coverages(*of_tiles, grid, settings.covered_from))
+        shares = shares.at[surface, sums.tiles].get(mode="fill", fill_value=0)
         return cls(
             view=view,
-            tiles=tiles,
-            in_front=own_front,
-            sums=share,
-            before=jnp.where(own_front[:, None], 0.0, before),
+            tiles=combination.own_rows(sums.tiles),
+            in_front=combination.own_rows(in_front),
+            sums=own,
+            share=combination.own_rows(shares),
             needed=combination.largest([sums.needed]),
-            full_coverage=settings.full_coverage,
         )
 
     @property
@@ -115,18 +152,11 @@ class VisibleSurfaces(eqx.Module):
     def grid(self) -> TileGrid:
         return TileGrid(self.view.width, self.view.height)
 
-    @property
-    def share(self) -> Float[Array, "places pixels"]:
-        """Compute the fraction of its pixel that each surface covers; behind, of the part that the
-        front leaves.
-        """
-        return coverage(self.sums.weights, self.full_coverage) * (1 - self.before)
-
     def gathered(self, combination: AbstractCombination) -> "VisibleSurfaces":
         """Return the places of all devices, without the rows of their sums."""
 
         def of_places(surfaces):
-            return surfaces.tiles, surfaces.in_front, surfaces.before, surfaces.sums
+            return surfaces.tiles, surfaces.in_front, surfaces.share, surfaces.sums
 
         *places, sums = of_places(self)
         parts = combination.gather((*places, PixelSums(sums.rows[:, :0], sums.weights)))

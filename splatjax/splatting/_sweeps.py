@@ -23,6 +23,7 @@ from ._bins import Bins, scatter_slots
 from ._fragments import Lanes, Slots, Sweep, second_limits
 from ._grid import TILE_SIDE
 from ._rasterizer import FragmentSums, PixelSums, SurfaceCapacity
+from ._views import OPEN
 
 
 class Spans(eqx.Module):
@@ -231,7 +232,7 @@ def sum_parts(
     opened = []
     for k, capacity in enumerate(capacities):
         sweep = first[k].sweep
-        is_open = weights[k] < sweep.full_coverage
+        is_open = weights[k] < OPEN
         opened.append(fronts[k].opened(is_open, capacity.behind, sweep.grid.count))
     tiles, near_limits, open_limits, needed = zip(*opened, strict=True)
     limits = combination.largest(

@@ -172,7 +172,7 @@ class TilePlan(AbstractRasterPlan):
         grid = self.rasterizer.grid(view)
         footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
         return (
-            Sweep(type(view), grid, settings.full_coverage, settings.filter_radius),
+            Sweep(type(view), grid, settings.filter_radius),
             bin_items(footprints.ranges(grid), grid, self.bins),
             jax.lax.stop_gradient(footprints.shift),
             tuple(getattr(footprints, name) for name in PLANES),

@@ -9,12 +9,15 @@ so that the surface in front has the largest nearness and no fragment needs a sq
 """
 
 import abc
+import dataclasses
+import math
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from splatjax._records import check_values
 from splatjax.scene import Splats
 
 from ._grid import TileGrid, TileRanges
@@ -22,10 +25,15 @@ from ._grid import TileGrid, TileRanges
 # Cosine to the line of sight, below which float32 cannot determine the visible side of a splat.
 EDGE_ON = 1e-5
 _SLOPE_FILTER = 0.25  # pixels; see `widen_ellipse`
+# The largest weight sum of full coverage: what is behind a front of less is summed.
+OPEN = 1.0
+# Unevenness of splats, and the fraction of their mean weight sum that covers a pixel.
+_EVEN, _SCATTERED = (0.1, 0.75), (0.35, 0.11)
+_MEAN_WEIGHT = (1 - 13 * math.exp(-4)) / 4  # `fragment_weight` over a disc
 
 
 class SplattingSettings(eqx.Module):
-    r"""Settings of the surface that splats form. All static.
+    r"""Settings of the surface that splats form. Static, but for the last.
 
     **Attributes:**
 
@@ -33,14 +41,50 @@ class SplattingSettings(eqx.Module):
       splat's weights over the pixels is independent of its position between them, to 4%.
     - `epsilon_z`: fragments within this many radii behind the front belong to it (3.1).
     - `largest_slope`: slanted splats have epsilon lengthened by `1 / cos`, up to this factor.
-    - `full_coverage`: weight sum from which on a pixel is covered. Splats whose radius is 1.5 times
-      the root of their area, scattered at random, have at least 0.2 inside a closed surface.
+    - `full_coverage`: weight sum from which on a surface covers a pixel beside the background, at
+      most 1. `None` to derive it from the splats (`measured`).
     """
 
     filter_radius: float = eqx.field(static=True, default=2**0.5)
     epsilon_z: float = eqx.field(static=True, default=1.5)
     largest_slope: float = eqx.field(static=True, default=3.0)
-    full_coverage: float = eqx.field(static=True, default=0.15)
+    full_coverage: float | Float[Array, ""] | None = None
+
+    def __check_init__(self):
+        if self.full_coverage is not None:
+            name = "SplattingSettings.full_coverage"
+            check_values(name, self.full_coverage, "in (0, 1]", lambda x: (x > 0) & (x <= OPEN))
+
+    @property
+    def covered_from(self) -> float | Float[Array, ""]:
+        """The value of `full_coverage`; it must be known."""
+        if self.full_coverage is None:
+            raise ValueError(
+                "full_coverage depends on the splats; call settings.measured(unevenness, discs)"
+            )
+        return self.full_coverage
+
+    def measured(
+        self, unevenness: Float[Array, ""], discs: Float[Array, ""]
+    ) -> "SplattingSettings":
+        """Return these settings with a value for `full_coverage`: a fraction of the mean weight
+        sum inside a surface of such splats.
+
+        The fraction is three quarters where splats are spread evenly, because the sum falls to a
+        half at an outline, and less the more it varies inside the surface.
+
+        **Arguments:**
+
+        - `unevenness`: see `splatjax.diffusion.unevenness`.
+        - `discs`: the sum of the squared radii of all splats over that of their areas.
+        """
+        if self.full_coverage is not None:
+            return self
+        (even, fraction_even), (scattered, fraction_scattered) = _EVEN, _SCATTERED
+        share = jnp.clip((unevenness - even) / (scattered - even), 0, 1)
+        fraction = fraction_even + share * (fraction_scattered - fraction_even)
+        full = jnp.minimum(fraction * _MEAN_WEIGHT * math.pi * discs, OPEN)
+        return dataclasses.replace(self, full_coverage=full)
 
 
 class Footprints(eqx.Module):

@@ -34,7 +34,7 @@ from splatjax.baselines import (
     thinning_error,
 )
 
-SETTINGS = sj.splatting.SplattingSettings()
+SETTINGS = sj.splatting.SplattingSettings(full_coverage=0.5)
 RASTERIZERS = {
     "elliptical": NearestRasterizer(),
     "ewa": BlendingRasterizer(EwaKernel()),
