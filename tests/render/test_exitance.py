@@ -22,6 +22,8 @@ from jax.test_util import check_grads
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser, ExitanceDiffuser, PlainMean, ShapeDiffuser
 
+pytestmark = pytest.mark.once
+
 SUMMED = dataclasses.replace(PLAIN, diffuser=ExitanceDiffuser(DenseDiffuser()))
 ERROR = 1e-2  # of the largest value: the gain is blended instead of the mass that it depends on
 

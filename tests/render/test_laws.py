@@ -20,7 +20,6 @@ from bodies import (
     two_gaussians,
     with_albedo,
 )
-from scipy.ndimage import binary_erosion
 
 import splatjax as sj
 from splatjax.render import _checks
@@ -122,44 +121,6 @@ def test_the_index_and_not_the_lobe_decides_what_enters_and_leaves():
     smooth = diffuse(eta=1.5, roughness=0.05) / diffuse(eta=1.0)
     np.testing.assert_allclose(smooth, expected, rtol=5e-3)
     assert np.all(bare < 0.99 * diffuse(eta=1.0, specular=0.0))
-
-
-def covered_by(splats: sj.Splats, camera: sj.Camera) -> np.ndarray:
-    scene = sj.Scene(splats, (lamp(),), sj.Material(two_gaussians()))
-    return np.asarray(sj.render(scene, camera, TILES).coverage, float)
-
-
-@pytest.mark.once
-@pytest.mark.parametrize(("size", "count"), [(32, 20_000), (96, 20_000), (192, 20_000)])
-def test_an_outline_is_where_the_body_ends_and_is_antialiased(size, count):
-    fov, distance = 18.0, 80.0
-    camera = sj.Camera.look_at([0, 0, distance], [0, 0, 0], fov=fov, width=size, height=size)
-    coverage = covered_by(sphere(count, 10.0, jitter=0.0), camera)
-    seen = 0.5 * size * np.tan(np.arcsin(10.0 / distance)) / np.tan(np.radians(fov / 2))
-    assert np.sqrt(np.sum(coverage) / np.pi) == pytest.approx(seen, abs=0.25)  # pixels
-    partly = (coverage > 0.05) & (coverage < 0.95)
-    assert np.sum(partly) > 0.65 * 2 * np.pi * seen
-    y, x = np.mgrid[:size, :size] + 0.5 - size / 2
-    assert np.min(coverage[np.hypot(x, y) < seen - 2]) > 0.999
-
-
-@pytest.mark.once
-@pytest.mark.parametrize("jitter", [0.1, 0.35])
-def test_a_surface_is_covered_however_evenly_its_splats_are_spread(jitter):
-    camera = sj.Camera.look_at([0, 0, 80], [0, 0, 0], fov=9, width=96, height=96)
-    coverage = covered_by(sphere(20_000, 10.0, jitter=jitter), camera)
-    assert np.mean(coverage) > 0.999  # the picture is inside the outline
-    assert np.mean(coverage < 0.99) < 5e-4
-
-
-@pytest.mark.once
-def test_creases_are_covered():
-    """Also where neither of two surfaces covers its pixel alone."""
-    camera = sj.Camera.look_at((330, 20, 700), (0, -45, 0), fov=30, width=256, height=256)
-    coverage = covered_by(sj.bust(30_000), camera)
-    inside = binary_erosion(coverage > 0.5, iterations=4)
-    assert inside.sum() > 15_000
-    assert np.all(coverage[inside] > 0.9)
 
 
 @pytest.mark.once

@@ -9,10 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from scipy.ndimage import binary_erosion
 
+import splatjax as sj
+from splatjax.diffusion import unevenness
 from splatjax.splatting import (
     DenseRasterizer,
     OrthographicView,
+    PerspectiveView,
     SplattingSettings,
     TileRasterizer,
     _rasterizer,
@@ -169,10 +173,10 @@ PLANE = 1e-5  # of the distance: float32's rounding, and what the quarter pixel 
 RASTERIZERS = {"plain": DenseRasterizer(), "tiles": TileRasterizer(lanes=8, slots=16)}
 
 
-def drawn(view, body, rows=None, rasterizer="plain"):
-    plan = RASTERIZERS[rasterizer].make_plan([body], [view], SETTINGS)
+def drawn(view, body, rows=None, rasterizer="plain", settings=SETTINGS):
+    plan = RASTERIZERS[rasterizer].make_plan([body], [view], settings)
     rows = jnp.zeros((0, body.count)) if rows is None else rows
-    return jax.jit(lambda body, rows: bodies.drawn(body, rows, view, SETTINGS, plan))(body, rows)
+    return jax.jit(lambda body, rows: bodies.drawn(body, rows, view, settings, plan))(body, rows)
 
 
 def seen_through(surfaces) -> tuple[np.ndarray, np.ndarray]:
@@ -277,6 +281,44 @@ def test_an_edge_hides_nothing_behind_it_however_small_the_splats(kind, rasteriz
     assert np.min(both) > 1 - 1e-6
 
 
+def covered(view, body) -> np.ndarray:
+    """The coverage by splats whose radius is 1.5 times the root of their area."""
+    settings = SplattingSettings().measured(unevenness(body), jnp.asarray(1.5**2))
+    return np.asarray(seen_through(drawn(view, body, None, "tiles", settings))[1], float)
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("size", [48, 96])
+def test_an_outline_is_where_the_body_ends_and_is_antialiased(size):
+    view, radius = bodies.perspective(width=size, height=size), 10.0
+    coverage = covered(view, bodies.sphere(20_000, radius, jitter=0.0))
+    scale = DISTANCE / float(view.pixel_size(jnp.asarray(DISTANCE)))
+    seen = scale * np.tan(np.arcsin(radius / DISTANCE))
+    assert np.sqrt(np.sum(coverage) / np.pi) == pytest.approx(seen, abs=0.25)  # pixels
+    assert np.sum((coverage > 0.05) & (coverage < 0.95)) > 0.6 * 2 * np.pi * seen
+    y, x = np.mgrid[:size, :size] + 0.5 - size / 2
+    assert np.min(coverage[np.hypot(x, y) < seen - 2]) > 0.999
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("jitter", [0.1, 0.35])
+def test_a_surface_is_covered_however_evenly_its_splats_are_spread(jitter):
+    view = bodies.perspective(width=96, height=96)
+    coverage = covered(view, bodies.sphere(20_000, 25.0, jitter=jitter))
+    assert np.all(coverage > 0)
+    assert np.mean(coverage < 0.99) < 5e-4
+
+
+@pytest.mark.once
+def test_creases_are_covered():
+    """Also where neither of two surfaces covers its pixel alone."""
+    camera = sj.Camera.look_at((330, 20, 700), (0, -45, 0), fov=30, width=128, height=128)
+    coverage = covered(PerspectiveView.of(camera), sj.bust(10_000))
+    inside = binary_erosion(coverage > 0.5, iterations=3)
+    assert inside.sum() > 4000
+    assert np.all(coverage[inside] > 0.9)
+
+
 def test_coverage_of_a_silhouette_is_differentiable(float64):
     view = bodies.perspective(width=24, height=24)
     body, ramp = bodies.sphere(200, 6.0), jnp.arange(24, dtype=float)
@@ -289,3 +331,9 @@ def test_coverage_of_a_silhouette_is_differentiable(float64):
 
     shift = jnp.asarray([0.1, -0.2, 0.3])
     check_grads(covered, (shift,), 1, ["rev"], atol=1e-5, rtol=1e-5, eps=1e-6)
+
+
+@pytest.mark.parametrize("full", [0.0, 1.5])
+def test_full_coverage_that_no_surface_has_is_refused(full):
+    with pytest.raises(ValueError, match="full_coverage"):
+        SplattingSettings(full_coverage=full)
