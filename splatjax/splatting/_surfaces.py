@@ -50,21 +50,25 @@ def coverages(
 ) -> tuple[Float[Array, "tiles pixels"], Float[Array, "tiles pixels"]]:
     r"""Compute the fraction of each pixel that the front surface covers, and the one behind it.
 
-    Both together cover a smooth step of the sum of their weights. Beside the background, which is
-    within two pixels of one that they leave open, it ends at `full`, so that outlines are where the
-    body ends. Elsewhere it ends at a sum that surfaces keep in creases, and between splats
-    scattered at random. The front covers a smooth step of its own sum up to `full`, or all if
-    nothing is behind it.
+    Each covers a smooth step of the sum of its weights, the one behind of the part that the front
+    leaves. Beside the background, which is within two pixels of one that both leave open, the step
+    ends at `full`, so that outlines are where the body ends. Elsewhere it ends at a sum that
+    surfaces keep in creases, and between splats scattered at random; of what both cover there, the
+    front has a share that ends at `full` too, or all if nothing is behind it.
 
     **Arguments:** `front`, `behind`: sums of weights. Differentiable.
     """
-    of_front, of_behind = coverage(front), coverage(behind)
-    is_open = grid.join(((1 - of_front) * (1 - of_behind))[:, None])
+
+    def over(of_front, of_behind):
+        return of_front + (1 - of_front) * of_behind
+
+    is_open = grid.join(1 - over(coverage(front), coverage(behind))[:, None])
     window = 1, 2 * _BESIDE + 1, 2 * _BESIDE + 1
     beside = jax.lax.reduce_window(is_open, -jnp.inf, jax.lax.max, window, (1, 1, 1), "SAME")
-    both = coverage(front + behind, CLOSED + grid.cut(beside)[:, 0] * (full - CLOSED))
+    closed = CLOSED + grid.cut(beside)[:, 0] * (full - CLOSED)
+    both = over(coverage(front, closed), coverage(behind, closed))
     of_front = coverage(front, full)
-    total = of_front + (1 - of_front) * of_behind
+    total = over(of_front, coverage(behind))
     exists = total > _TINY
     of_front = both * jnp.where(exists, of_front / jnp.where(exists, total, 1.0), 1.0)
     return of_front, both - of_front
