@@ -57,9 +57,9 @@ def plan_for(view, body, rasterizer=TileRasterizer(lanes=8, slots=16)):
 
 
 @eqx.filter_jit
-def visibility(body, view, plan, settings=SETTINGS, splatting=SPLATTING):
+def visibility(body, view, plan, settings=SETTINGS):
     """Compute how much of the light each splat gets; NaN where the plan's capacity is exceeded."""
-    shadow_map = make_shadow_map(body, view, splatting, plan, DeviceMesh())
+    shadow_map = make_shadow_map(body, view, SPLATTING, plan, DeviceMesh())
     return compute_visibility(body, shadow_map, settings)
 
 
