@@ -113,19 +113,20 @@ def _left_out(item) -> bool:
 
 
 # Beside tests marked `once`: what JAX has little part in.
-ONCE = ("io/test_corpus", "geometry/test_raw_points", "test_imports", "cli/test_faults", "plots/")
-# What is about files, words and searches, and not about sums that an optimizing compiler rounds.
-UNOPTIMIZED = (
+ONCE = (
     "tests/io/",
     "tests/cli/",
     "tests/exports/",
     "tests/documents/",
-    "tests/inverse/",
-    "tests/fitting/",
+    "tests/plots/",
+    "geometry/test_raw_points",
+    "geometry/test_sampling",
     "test_cache",
     "test_chunking",
-    "test_records",
+    "test_imports",
 )
+# What is about files, words and searches, and not about sums that an optimizing compiler rounds.
+UNOPTIMIZED = ("tests/inverse/", "tests/fitting/", "test_records")
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest chooses by marks
