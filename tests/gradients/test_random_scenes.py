@@ -355,6 +355,7 @@ def test_gradients_are_finite_at_degenerate_places_and_with_one_splat_or_none(sh
     assert is_finite(shape, world)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("above", [0.0, 1e-14, 1e-7, 1e-5])
 def test_gradients_are_finite_with_a_light_on_the_surface(above):
     shape = SHAPES[1]

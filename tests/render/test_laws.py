@@ -76,7 +76,7 @@ FURNACES = {
 
 @pytest.mark.slow
 @pytest.mark.once
-@pytest.mark.parametrize("lights", FURNACES)
+@pytest.mark.parametrize("lights", ["environment", pytest.param("lamps", marks=pytest.mark.long)])
 def test_white_furnace(lights):
     lights, least, most = FURNACES[lights]
     white = sj.Material(two_gaussians().white(), specular=1.0, roughness=0.6)
@@ -159,14 +159,20 @@ def test_a_plan_holds_for_splats_that_move_a_little_and_else_poisons_the_picture
     assert np.all(np.isnan(frame.coverage))
 
 
-@pytest.mark.once
-def test_a_plan_for_too_few_splats_poisons_all_that_is_made_of_them_and_its_derivative():
+@pytest.fixture
+def short_of_splats():
+    """A scene, a camera, and a plan for half as many splats as are in front."""
     material = sj.Material(sj.SumOfGaussians([1.0], [[0.5, 0.4, 0.3]]))
-    scene = sj.Scene(sheet(6.0, 1.0), (lamp(),), material)
-    camera = camera_over(5.0, 16)
+    scene, camera = sj.Scene(sheet(6.0, 1.0), (lamp(),), material), camera_over(5.0, 16)
     plan = sj.make_plan(scene, camera, TILES)
     half = plan.raster.splats // 2
     short = dataclasses.replace(plan, raster=dataclasses.replace(plan.raster, splats=half))
+    return scene, camera, short
+
+
+@pytest.mark.once
+def test_a_plan_for_too_few_splats_poisons_the_picture_and_its_derivative(short_of_splats):
+    scene, camera, short = short_of_splats
 
     @jax.jit
     @jax.value_and_grad
@@ -177,6 +183,12 @@ def test_a_plan_for_too_few_splats_poisons_all_that_is_made_of_them_and_its_deri
     picture, slope = total(scene.splats.radii)
     assert np.isnan(picture)
     assert np.any(np.isnan(slope))  # where a pixel sees a splat: no step can be taken
+
+
+@pytest.mark.once
+@pytest.mark.long
+def test_a_plan_for_too_few_splats_poisons_what_else_is_made_of_them(short_of_splats):
+    scene, camera, short = short_of_splats
     jacobian = sj.picture_jacobian(scene, camera, TILES, short)
     assert float(jacobian.frame.overflow) > 1
     assert np.all(np.isnan(jacobian.weights))

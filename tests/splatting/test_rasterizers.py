@@ -117,7 +117,7 @@ def test_tiles_give_what_the_plain_rasterizer_gives(float64, count, perspective)
 
 
 @pytest.mark.once
-@pytest.mark.parametrize("perspective", [True, False])
+@pytest.mark.parametrize("perspective", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_in_float32_too(perspective):
     def off(ours, theirs):
         error = np.abs(ours - theirs) / np.max(np.abs(theirs), initial=1e-12)
