@@ -49,8 +49,10 @@ lint: setup
 test-float32: setup
 	$(PYTEST) -m "not once and not unoptimized and not long"
 
+# Shapes are checked in the other runs.
 test-x64: setup
-	JAX_ENABLE_X64=1 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(PYTEST) -m "not long"
+	JAX_ENABLE_X64=1 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(PYTEST) --jaxtyping-packages=none,beartype.beartype \
+	    -m "not long"
 
 # Long tests whose answer float64 does not change, and those of files and searches, which no optimization changes.
 test-once: setup
