@@ -43,14 +43,15 @@ def lights_by_kind(
     lights: tuple[AbstractLight, ...],
 ) -> list[list[tuple[int, AbstractLightSample]]]:
     """List the samples of each kind of lights, each with the index of its light. Lights with one
-    highlight for all samples are listed separately.
+    highlight for all samples are listed separately. Kinds are sorted, so that the order of lights
+    needs no program of its own.
     """
     kinds: dict[object, list[tuple[int, AbstractLightSample]]] = {}
     for index, light in enumerate(lights):
         has_lobes = type(light).highlight is AbstractLight.highlight
         for sample in light.samples():
             kinds.setdefault((jax.tree.structure(sample), has_lobes), []).append((index, sample))
-    return list(kinds.values())
+    return [kinds[kind] for kind in sorted(kinds, key=str)]
 
 
 def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:

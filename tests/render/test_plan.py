@@ -256,7 +256,7 @@ def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compi
         render(bust, lights=[lamp(-1.0, 0.2, -0.4)]),
         # Lights are sorted by kind.
         render(bust, lights=[low, point(130.0), left]),
-        render(bust, lights=[left, point(130.0), low, low]),
+        render(bust, lights=[point(130.0), left, low, low]),
     ]
     assert compiled == []
     for i, other in enumerate(others):
