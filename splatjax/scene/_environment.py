@@ -11,7 +11,6 @@ import numpy as np
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, DTypeLike, Float
 
-from splatjax._chunking import jit_unless_traced
 from splatjax._records import check_values, numbers, record
 
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, DistantStratum
@@ -97,7 +96,6 @@ class EnvironmentLight(AbstractExtendedLight):
         tilt = [1 - x * x * lean, x, -x * z * lean, -x, y, -z, -x * z * lean, z, 1 - z * z * lean]
         return jnp.stack(tilt).reshape(3, 3) @ jnp.stack(rows).reshape(3, 3)
 
-    @jit_unless_traced
     def stacked_samples(self) -> AbstractLightSample:
         height = self.image.shape[0]
         directions, solid_angles = pixel_directions(height, self.image.dtype)

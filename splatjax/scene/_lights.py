@@ -4,13 +4,14 @@ surface towards the light.
 
 import abc
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
@@ -133,10 +134,23 @@ class AbstractExtendedLight(AbstractLight):
     def stacked_samples(self) -> AbstractLightSample:
         """Return the samples, stacked along the first axis of every leaf."""
 
-    @jit_unless_traced
     def samples(self) -> tuple[AbstractLightSample, ...]:
-        leaves, structure = jax.tree.flatten(self.stacked_samples())
-        return tuple(map(structure.unflatten, zip(*map(jnp.unstack, leaves), strict=True)))
+        leaves, structure = jax.tree.flatten(_stacked_samples(self))
+        return tuple(map(structure.unflatten, zip(*map(_rows, leaves), strict=True)))
+
+
+@jit_unless_traced
+def _stacked_samples(light: AbstractExtendedLight) -> AbstractLightSample:
+    return light.stacked_samples()
+
+
+def _rows(leaf: Float[Array, "rows ..."]) -> Sequence[Float[Array, "..."]]:
+    """Return the rows of an array. Outside `jit` nothing is compiled, where each row would be a
+    kernel of its own.
+    """
+    if isinstance(leaf, Tracer):
+        return jnp.unstack(leaf)
+    return jax.device_put(list(np.asarray(leaf)))
 
 
 def _per_channel(
