@@ -111,7 +111,10 @@ def compare(count: int, perspective: bool, off, bounds: tuple[float, float]) -> 
     assert count == 1 or perspective or most_open > TILES.lanes
 
 
-@pytest.mark.parametrize(("count", "perspective"), [(24, True), (24, False), (1, True)])
+@pytest.mark.parametrize(
+    ("count", "perspective"),
+    [(24, True), (24, False), pytest.param(1, True, marks=pytest.mark.long)],
+)
 def test_tiles_give_what_the_plain_rasterizer_gives(float64, count, perspective):
     compare(count, perspective, disagreement, (VALUE, GRADIENT))
 
