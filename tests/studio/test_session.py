@@ -34,10 +34,15 @@ RECIPE = {
 
 @pytest.fixture(scope="module")
 def studio():
+    """Marble, by three Gaussians: each more takes its time to compile."""
     names = {"sj": sj, "dataclasses": dataclasses}
     splats, lights = (eval(RECIPE[name], names) for name in ("splats", "lights"))
     camera = sj.Camera.look_at([20, 0, 70], [0, 0, 0], width=SIDE, height=SIDE)
-    return Session(sj.Scene(splats, lights, sj.load_material("marble")), camera, [0, 0, 0])
+    marble = sj.load_material("marble")
+    variances, weights = np.asarray(marble.gaussians.variances), marble.gaussians.weights
+    gaussians = sj.SumOfGaussians(variances[::2], np.reshape(weights, (3, 2, 3)).sum(axis=1))
+    material = dataclasses.replace(marble, gaussians=gaussians)
+    return Session(sj.Scene(splats, lights, material), camera, [0, 0, 0])
 
 
 def with_(controls, **changes):
@@ -46,22 +51,19 @@ def with_(controls, **changes):
 
 @pytest.fixture(scope="module")
 def states(studio):
-    """One change of each kind."""
-    start = studio.start
-    double = tuple(2 * number for number in start.sigma_a)
-    return {
-        "start": start,
-        "absorption": with_(start, sigma_a=double, exposure=0.5),
-        "surface": with_(start, eta=1.3, specular=0.5, roughness=0.5, scale=0.7),
-        "camera and light": with_(start, eye=(-40.0, 20.0, 30.0), turn=70.0),
-    }
+    """One change of each kind, each beside those before."""
+    double = tuple(2 * number for number in studio.start.sigma_a)
+    absorption = with_(studio.start, sigma_a=double, exposure=0.5)
+    surface = with_(absorption, eta=1.3, specular=0.5, roughness=0.5, scale=0.7)
+    moved = with_(surface, eye=(-40.0, 20.0, 30.0), turn=70.0)
+    return {"absorption": absorption, "surface": surface, "camera and light": moved}
 
 
 def shown(frame, controls) -> np.ndarray:
     return sj._display.to_display(np.asarray(frame.beauty), controls.exposure).astype(int)
 
 
-@pytest.mark.parametrize("name", ["start", "absorption", "surface", "camera and light"])
+@pytest.mark.parametrize("name", ["absorption", "surface", "camera and light"])
 def test_a_picture_is_that_of_render(studio, states, name):
     controls = states[name]
     draft, picture = studio.draft(controls).astype(int), studio.picture(controls)
@@ -94,26 +96,27 @@ def test_coefficients_are_fitted_as_a_material_is(studio, states):
     assert [row.shape for row in rows] == [radii.shape] * 6
 
 
-def test_a_thousand_changes_compile_nothing_and_keep_nothing(studio, states, compiled):
+def test_many_changes_compile_nothing_and_keep_nothing(studio, states, compiled):
     def change(i: int) -> None:
         factor, moved = 1.5 + 0.3 * np.sin(i), {"scale": 0.5 + 0.4 * np.cos(i)}
-        if i % 20 == 0:
+        if i % 10 == 0:
             moved["sigma_a"] = tuple(factor * number for number in studio.start.sigma_a)
-        if i % 100 == 0:
+        if i % 50 == 0:
             moved["eye"] = 20.0 * np.cos(i), 5.0, 70.0
         studio.draft(with_(studio.start, **moved))
 
-    for name in (*states, "start"):
-        studio.draft(states[name])
-        studio.picture(states[name])
-    for i in range(30):
+    for controls in (*states.values(), studio.start):
+        studio.draft(controls)
+        studio.picture(controls)
+    for i in range(20):
         change(i)
     compiled.clear()
-    before = sum(array.nbytes for array in jax.live_arrays())
-    for i in range(30, 1030):
+    before = len(jax.live_arrays()), sum(array.nbytes for array in jax.live_arrays())
+    for i in range(20, 220):
         change(i)
     assert compiled == []
-    assert sum(array.nbytes for array in jax.live_arrays()) < 1.01 * before
+    after = len(jax.live_arrays()), sum(array.nbytes for array in jax.live_arrays())
+    np.testing.assert_array_less(after, 1.01 * np.asarray(before))
 
 
 @pytest.mark.parametrize("layer", ["diffuse", "specular", "albedo", "irradiance", "shadow"])
