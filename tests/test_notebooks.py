@@ -14,6 +14,7 @@ from nbclient import NotebookClient
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 # They take a quarter of a minute or more: `make test-long` runs them, `make test` does not.
 LONG = {
+    "fit_marble",
     "gradients",
     "measured_material",
     "new_material",

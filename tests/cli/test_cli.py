@@ -23,7 +23,7 @@ from splatjax.cli._main import prepare_jax
 from splatjax.cli._render import Render
 from splatjax.cli._view import direction_to
 
-SMALL = ["--count", "1500", "--width", "64", "--height", "64", "--light-azimuth", "-20"]
+SMALL = ["--count", "400", "--width", "32", "--height", "32", "--light-azimuth", "-20"]
 
 
 def test_materials_lists_the_library_with_its_sources(capsys):
@@ -115,7 +115,7 @@ def test_render_shows_the_bust_and_its_manifest_makes_the_same_picture(plain, tm
     np.testing.assert_allclose(np.sum(np.asarray(frame.weights), axis=0), 1.0, rtol=1e-5)
     assert 0.1 < np.mean(np.asarray(frame.coverage)) < 0.9
     with Image.open(picture) as shown:
-        assert shown.size == (64, 64)
+        assert shown.size == (32, 32)
         assert np.asarray(shown).max() > 100
     material, again = tmp_path / "again.toml", tmp_path / "again.exr"
     material.write_text(manifest["contents of --material"], encoding="utf-8")

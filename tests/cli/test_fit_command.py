@@ -23,8 +23,8 @@ pytestmark = pytest.mark.once
 SKIN = [0.4395, 0.2133, 0.1155]  # what leaves skin1, by Monte Carlo (MCML)
 OWN = """[medium]
 unit = "1/mm"
-sigma_a = [0.0021, 0.0041, 0.0071]
-sigma_s_prime = [2.19, 2.62, 3.0]
+sigma_a = [0.03, 0.2, 0.5]
+sigma_s_prime = [0.7, 0.9, 1.0]
 eta = 1.5
 [surface]
 roughness = 0.11
@@ -54,14 +54,14 @@ def fits_end_as(monkeypatch):
 
 def test_it_prints_and_writes_a_material_that_loads(tmp_path, capsys):
     output, plot = tmp_path / "mine.toml", tmp_path / "mine.png"
-    assert run("fit", "skin1", "--count", "1", "--output", output, "--plot", plot) == 0
+    assert run("fit", "skin1", "--count", 2, "--output", output, "--plot", plot) == 0
     printed = capsys.readouterr().out
     assert "error (Eq. 4)" in printed
     assert "fit over profile, less 1" in printed
     assert printed.splitlines()[-2:] == [str(output), str(plot)]
     with Image.open(plot) as picture:
         assert min(picture.size) > 400
-    assert sj.load_material(output).gaussians.weights.shape == (1, 3)
+    assert sj.load_material(output).gaussians.weights.shape == (2, 3)
     np.testing.assert_allclose(reflectance(output), SKIN, rtol=1e-3)
     grazing, normal = np.asarray(sj.load_material(output).angles(jnp.asarray([0.1, 1.0])))
     np.testing.assert_allclose(normal, 1, rtol=1e-5)
@@ -175,15 +175,15 @@ def test_a_fit_that_does_not_settle_names_the_remedy(
 def test_a_fit_to_its_own_file_keeps_what_stood_there(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(OWN)
-    assert run("fit", path, "--count", 1, "--output", path) == 0
+    assert run("fit", path, "--count", 2, "--output", path) == 0
     after = tomllib.loads(path.read_text())
     assert after["medium"]["sigma_a"] == tomllib.loads(OWN)["medium"]["sigma_a"]
     assert after["surface"] == {"eta": 1.5, "specular": 0.07, "roughness": 0.11}
     assert after["source"]["citation"] == "measured by hand"
     assert after["source"]["provenance"].startswith("the third sample; fitted by splatjax")
-    assert len(after["fit"]["variances"]) == 1
+    assert len(after["fit"]["variances"]) == 2
     with jax.enable_x64(True):
-        assert run("fit", path, "--count", 1, "--output", path) == 0
+        assert run("fit", path, "--count", 2, "--output", path) == 0
     assert tomllib.loads(path.read_text())["surface"] == after["surface"]
 
 
@@ -221,17 +221,21 @@ def test_a_table_of_media_becomes_a_table_of_fits_and_is_continued(
     rows = list(csv.DictReader(output.read_text().splitlines()))
     assert [row["name"] for row in rows] == [line[0] for line in MEDIA[1:]]
     assert all(float(row["converged"]) == 1 for row in rows)
+    alone = tmp_path / "alone.toml"
+    alone.write_text(
+        '[medium]\nunit = "1/mm"\nsigma_a = [0.03, 0.03, 0.03]\n'
+        "sigma_s_prime = [0.7, 0.7, 0.7]\neta = 1.2\n"
+    )
+    assert run("fit", alone, "--count", 2, "--output", alone) == 0
     with jax.enable_x64(True):
-        medium = sj.Medium(*(jnp.asarray([value]) for value in (0.03, 0.7, 1.2)))
-        weights = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
-        model = sj.fitting.TransportModel()
-        alone = sj.fit_gaussians(model.profile(medium), 2, weights=weights, rule=model.rule)
-        expected = [*alone.gaussians.variances, *alone.gaussians.weights[:, 0], alone.error[0]]
-        expected += [*model.angles(medium).coefficients[:, 0]]
-        columns = ("variance_1", "variance_2", "weight_1", "weight_2", "error")
-        columns += tuple(f"angles_{power}" for power in range(5))
-        found = [float(rows[3][column]) for column in columns]
-        np.testing.assert_allclose(found, np.asarray(expected), rtol=1e-6)
+        material = sj.load_material(alone)
+    (first, second), angles = material.gaussians.variances, material.angles.coefficients[:, 0]
+    error = tomllib.loads(alone.read_text())["fit"]["error"][0]
+    columns = ("variance_1", "variance_2", "weight_1", "weight_2", "error")
+    columns += tuple(f"angles_{power}" for power in range(5))
+    found = [float(rows[3][column]) for column in columns]
+    expected = [first, second, *material.gaussians.weights[:, 0], error, *angles]
+    np.testing.assert_allclose(found, np.asarray(expected), rtol=1e-6)
 
 
 def test_it_reports_how_many_did_not_converge(media, tmp_path, monkeypatch, capsys):

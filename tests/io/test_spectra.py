@@ -77,9 +77,10 @@ def test_a_projected_picture_is_the_picture_of_projected_weights():
         material = sj.Material(sj.SumOfGaussians([0.5, 9.0], weights), specular=0.0)
         return np.asarray(sj.render(sj.Scene(body, light, material), view(), settings).beauty)
 
-    many, three = picture(weights), picture(weights @ matrix)
+    # Black channels beside three: one program renders both pictures.
+    three = picture(np.pad(weights @ matrix, ((0, 0), (0, 28))))[..., :3]
     assert three.max() > 0.1
-    np.testing.assert_allclose(many @ matrix, three, atol=1e-5)
+    np.testing.assert_allclose(picture(weights) @ matrix, three, atol=1e-5)
 
 
 def test_an_unknown_illuminant_is_named():
