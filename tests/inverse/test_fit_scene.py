@@ -63,8 +63,8 @@ PARTS = (
 @cache
 def body() -> sj.Splats:
     """A bumpy ball with a map, and one on either side that no picture shows."""
-    aside = [sphere(18, 4.0, center=(x, 0.0, 0.0)) for x in (-60.0, 60.0)]
-    splats = joined(bumpy(160), *aside)
+    aside = [sphere(12, 4.0, center=(x, 0.0, 0.0)) for x in (-60.0, 60.0)]
+    splats = joined(bumpy(100), *aside)
     albedo = np.random.default_rng(2).uniform(0.3, 0.9, (splats.count, 2))
     return dataclasses.replace(with_albedo(splats, albedo), weights=np.ones((splats.count, 2, 2)))
 
@@ -247,10 +247,10 @@ class TestFitScene:
     def test_a_shape_comes_back(self):
         part, pictured = PARTS[2], PicturedScene(body(), camera(), (lights()[0],))
         zeros = MovableScene.of(body(), material(), PARTS).start([pictured])
-        x = jnp.asarray(40 * np.random.default_rng(4).normal(size=body().count))
+        x = jnp.asarray(60 * np.random.default_rng(4).normal(size=body().count))
         dented = part.moved(pictured, x, part.prepared(body())).splats
         own = (*zeros[:2], x, *(one[0] for one in zeros[3:]))
-        found = fitted(sj.inverse.NormalOffsets, steps=60, seen=observations(x=own))
+        found = fitted(sj.inverse.NormalOffsets, steps=150, seen=observations(x=own))
         before, after = (
             degrees(each.normals, dented.normals)[seen_well(dented)]
             for each in (body(), found.splats)

@@ -2,7 +2,7 @@
 pictures are linear in the weights, without a renderer.
 """
 
-from functools import partial
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -28,10 +28,14 @@ def dyed(dye, dirt) -> sj.SumOfGaussians:
     return sj.SumOfGaussians(variances, weights * np.exp(-FALLS[0] * dye - FALLS[1] * dirt))
 
 
-def make_part(**more) -> sj.inverse.ParameterMap:
+@cache
+def table() -> sj.fitting.WeightTable:
     nodes = {"dye": [0.1, 0.2, 0.4, 0.8], "dirt": [0.0, 0.1, 0.2, 0.3]}
-    table = sj.fitting.weight_table(dyed, nodes, sj.SumOfGaussians(*GAUSSIANS))
-    return sj.inverse.ParameterMap(table, **({"start": START, "smoothness": 4.0} | more))
+    return sj.fitting.weight_table(dyed, nodes, sj.SumOfGaussians(*GAUSSIANS))
+
+
+def make_part(**more) -> sj.inverse.ParameterMap:
+    return sj.inverse.ParameterMap(table(), **({"start": START, "smoothness": 4.0} | more))
 
 
 def material() -> sj.Material:

@@ -200,6 +200,7 @@ def wait_until(is_true) -> None:
 @VISER
 def test_only_this_computer_reaches_the_page_and_it_writes_to_one_folder(page, tmp_path):
     assert page.url.startswith("http://127.0.0.1:")
+    assert page.url in page._repr_html_()  # as a notebook shows it
     assert page._server.get_host() == "127.0.0.1"
     assert page._server.request_share_url() is None
     page._handles["sigma_a 0"].value = 1.0
@@ -214,11 +215,6 @@ def test_only_this_computer_reaches_the_page_and_it_writes_to_one_folder(page, t
     wait_until(lambda: "Error" in page._status.content)
     page._change()
     wait_until(lambda: page._status.content == "")
-
-
-@VISER
-def test_it_shows_itself_in_a_notebook(page):
-    assert page.url in page._repr_html_()
 
 
 @VISER
