@@ -20,6 +20,8 @@ from bodies import (
 import splatjax as sj
 from splatjax.inverse import _fit_scene
 
+pytestmark = pytest.mark.once
+
 SIZE = 16
 camera = partial(view, size=SIZE)
 

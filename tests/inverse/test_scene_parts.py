@@ -35,6 +35,7 @@ def test_a_rotation_has_a_derivative_where_there_is_none():
     np.testing.assert_allclose(slope @ x @ y, z, atol=1e-7)
 
 
+@pytest.mark.once
 def test_lights_move_each_in_its_own_way():
     beam = sj.GaussianBeam([1, 2, 3], [0, 0, -2], power=[4, 5], variance=1)
     lights = sj.PointLight([1, 2, 3], intensity=[4, 5]), beam
@@ -56,6 +57,7 @@ def test_lights_move_each_in_its_own_way():
     np.testing.assert_allclose(beam.power, [4 * np.exp(1), 5], rtol=1e-6)
 
 
+@pytest.mark.once
 def test_a_camera_turns_around_the_body():
     middle, part = jnp.asarray([0.5, -1.0, 0.3]), sj.inverse.CameraPoses(turn=0.2, shift=0.5)
 
@@ -71,6 +73,7 @@ def test_a_camera_turns_around_the_body():
     np.testing.assert_allclose(shifted.camera.rotation, CAMERA.rotation, atol=1e-6)
 
 
+@pytest.mark.once
 def test_an_albedo_stays_between_0_and_1():
     albedo = jnp.linspace(0.0, 1.0, 40).reshape(20, 2)
     splats = bodies.with_albedo(bodies.sphere(20), albedo)
@@ -88,6 +91,7 @@ def test_an_albedo_stays_between_0_and_1():
     )
 
 
+@pytest.mark.once
 def test_normals_and_areas_follow_a_paraboloid():
     x, y, _ = np.asarray(FLAT.centers).T
     heights = 0.3 + 0.1 * x - 0.05 * y + 0.02 * x * x + 0.03 * x * y - 0.01 * y * y
@@ -101,6 +105,7 @@ def test_normals_and_areas_follow_a_paraboloid():
     np.testing.assert_allclose(moved.areas, np.asarray(FLAT.areas) * stretch, rtol=1e-4)
 
 
+@pytest.mark.once
 def test_a_ball_that_grows_stays_a_ball():
     ball = bodies.sphere(400)
     part = sj.inverse.NormalOffsets(step=0.5, smoothness=2.0, deviation=1.0)
@@ -111,6 +116,7 @@ def test_a_ball_that_grows_stays_a_ball():
     np.testing.assert_allclose(moved.radii, 1.1 * ball.radii, rtol=1e-2)
 
 
+@pytest.mark.once
 def test_offsets_are_means_of_coordinates_over_the_same_side_of_a_sheet():
     behind = sj.Splats(
         FLAT.centers - jnp.asarray([[0.0, 0.0, 0.2]]), -FLAT.normals, FLAT.radii, FLAT.areas
