@@ -4,6 +4,7 @@ beyond the committed table is a decision: `SPLATJAX_BUDGET=write` rewrites it.
 
 import json
 import os
+import re
 from importlib.metadata import version
 from pathlib import Path
 
@@ -21,9 +22,11 @@ SPARE = 1.01  # so little is no decision
 
 
 def size_of(function, *given) -> dict[str, int]:
-    """Count the functions of a program, and the operations of all, as XLA is given them."""
-    text = jax.jit(function).lower(*given).as_text()
-    return {"functions": text.count("func.func"), "operations": text.count(" = ")}
+    """Count the distinct computations of a compiled program, and the instructions of all."""
+    text = jax.jit(function).lower(*given).compile().as_text()
+    text = re.sub(r", metadata=\{[^}]*\}|[\w.\-]+(?=: )|%[\w.\-]+", "", text)
+    fused = {body for body in text.split("\n\n") if "ROOT" in body and "ENTRY" not in body}
+    return {"distinct computations": len(fused), "instructions": text.count(" = ")}
 
 
 @pytest.mark.once

@@ -1,11 +1,14 @@
 """A scene under changing controls: what is shown is what `render` makes of it, what is kept stays
 bounded, and what is saved makes the picture again.
 
-Its page: with viser, `pip install viser`.
+Its page: with viser, `pip install viser`; and in a browser, with `pip install playwright` and
+Debian's chromium.
 """
 
 import dataclasses
+import io
 import runpy
+import shutil
 import time
 
 import jax
@@ -19,6 +22,164 @@ from splatjax.studio import Page, Search, Session, save, turned
 pytestmark = pytest.mark.once
 
 SIDE = 48
+# Levels of 255: rounding.
+SAME = 1
+# The mean of a picture of 375 splats and 16 x 16 pixels.
+COARSE = 0.25
+RECIPE = {
+    "splats": "dataclasses.replace(sj.bust(1500).scaled(0.1), albedo=None)",
+    "lights": "[sj.DirectionalLight([1, -0.3, -1], 3.0)]",
+}
+
+
+@pytest.fixture(scope="module")
+def studio():
+    names = {"sj": sj, "dataclasses": dataclasses}
+    splats, lights = (eval(RECIPE[name], names) for name in ("splats", "lights"))
+    camera = sj.Camera.look_at([20, 0, 70], [0, 0, 0], width=SIDE, height=SIDE)
+    return Session(sj.Scene(splats, lights, sj.load_material("marble")), camera, [0, 0, 0])
+
+
+def with_(controls, **changes):
+    return dataclasses.replace(controls, **changes)
+
+
+@pytest.fixture(scope="module")
+def states(studio):
+    """One change of each kind."""
+    start = studio.start
+    double = tuple(2 * number for number in start.sigma_a)
+    return {
+        "start": start,
+        "absorption": with_(start, sigma_a=double, exposure=0.5),
+        "surface": with_(start, eta=1.3, specular=0.5, roughness=0.5, scale=0.7),
+        "camera and light": with_(start, eye=(-40.0, 20.0, 30.0), turn=70.0),
+    }
+
+
+def shown(frame, controls) -> np.ndarray:
+    return sj._display.to_display(np.asarray(frame.beauty), controls.exposure).astype(int)
+
+
+@pytest.mark.parametrize("name", ["start", "absorption", "surface", "camera and light"])
+def test_a_picture_is_that_of_render(studio, states, name):
+    controls = states[name]
+    draft, picture = studio.draft(controls).astype(int), studio.picture(controls)
+    assert picture.max() > 50
+    frame = sj.render(studio.scene(controls), studio.camera(controls))
+    assert np.abs(shown(frame, controls) - picture).max() <= SAME
+    assert draft.mean() == pytest.approx(picture.mean(), rel=COARSE)
+
+
+def test_coefficients_are_fitted_as_a_material_is(studio, states):
+    """The Gaussians of changed coefficients conserve the total of light transport; at rest their
+    error is not above that of the variances before.
+    """
+    controls = states["absorption"]
+    studio.picture(studio.start)
+    errors = []
+    for settle in (False, True):
+        if settle:
+            studio.picture(controls)
+        material = studio.scene(controls).material
+        profile = studio.model.profile(material.medium)
+        total = profile.total_reflectance()
+        np.testing.assert_allclose(material.gaussians.total_reflectance(), total, rtol=1e-5)
+        errors.append(sj.fitting.relative_error(profile, material.gaussians, studio.model.rule))
+    assert np.max(errors[1]) < np.max(errors[0])
+    own = studio.own.material
+    np.testing.assert_allclose(material.medium.sigma_a, 2 * own.medium.sigma_a, rtol=1e-6)
+    np.testing.assert_array_less(material.gaussians.total_reflectance(), own.total_reflectance())
+    radii, *rows = studio.curves(controls)
+    assert [row.shape for row in rows] == [radii.shape] * 6
+
+
+def test_a_thousand_changes_compile_nothing_and_keep_nothing(studio, states, compiled):
+    def change(i: int) -> None:
+        factor, moved = 1.5 + 0.3 * np.sin(i), {"scale": 0.5 + 0.4 * np.cos(i)}
+        if i % 20 == 0:
+            moved["sigma_a"] = tuple(factor * number for number in studio.start.sigma_a)
+        if i % 100 == 0:
+            moved["eye"] = 20.0 * np.cos(i), 5.0, 70.0
+        studio.draft(with_(studio.start, **moved))
+
+    for name in (*states, "start"):
+        studio.draft(states[name])
+        studio.picture(states[name])
+    for i in range(30):
+        change(i)
+    compiled.clear()
+    before = sum(array.nbytes for array in jax.live_arrays())
+    for i in range(30, 1030):
+        change(i)
+    assert compiled == []
+    assert sum(array.nbytes for array in jax.live_arrays()) < 1.01 * before
+
+
+@pytest.mark.parametrize("layer", ["diffuse", "specular", "albedo", "irradiance", "shadow"])
+def test_layers_are_those_of_the_frame(studio, layer):
+    controls = with_(studio.start, layer=layer)
+    frame = studio.frame(controls)
+    layers = {"shadow": np.asarray(frame.shadow).mean(axis=0)[..., None]}
+    expected = sj._display.to_display(np.asarray(layers.get(layer, getattr(frame, layer, None))))
+    assert np.abs(expected.astype(int) - studio.picture(controls)).max() <= SAME
+
+
+def test_what_is_saved_makes_the_picture_again(studio, states, tmp_path):
+    controls = with_(states["absorption"], turn=30.0)
+    paths = [
+        path
+        for kind in ("PNG", "EXR", "Python")
+        for path in save(studio, controls, tmp_path, RECIPE, kind)
+    ]
+    names = ["studio_000.png", "studio_001.exr", "studio_002.toml", "studio_002.py"]
+    assert [path.name for path in paths] == names
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
+    runpy.run_path(str(paths[-1]))
+    first, again = (
+        np.asarray(Image.open(path), int) for path in (paths[0], paths[-1].with_suffix(".png"))
+    )
+    assert np.abs(first - again).max() <= SAME
+    frame = sj.read_exr(paths[1])
+    assert np.abs(shown(frame, controls) - first).max() <= SAME
+    assert "studio_001.png" in sj.io.read_manifest(paths[1])["program"]
+
+
+def test_lights_turn_about_the_vertical_axis():
+    lights = [
+        sj.DirectionalLight([0, -1, 1], 3.0),
+        sj.PointLight([0, 5, 2], 3.0),
+        sj.EnvironmentLight(np.ones((4, 8, 3)), 10.0),
+    ]
+    distant, point, environment = turned(lights, 90.0)
+    np.testing.assert_allclose(distant.direction, [1, -1, 0], atol=1e-6)
+    np.testing.assert_allclose(point.position, [2, 5, 0], atol=1e-6)
+    assert float(environment.rotation) == 100.0
+    with pytest.raises(ValueError, match="HarmonicLight cannot be turned"):
+        turned([sj.scene.HarmonicLight(np.zeros((4, 3)))], 1.0)
+
+
+def test_a_search_needs_coefficients_to_start_from(studio):
+    material = dataclasses.replace(studio.own.material, medium=None)
+    scene = dataclasses.replace(studio.own, material=material)
+    session = Session(scene, studio.camera(studio.start), [0, 0, 0])
+    with pytest.raises(ValueError, match=r"add \[medium\]"):
+        Search(session, [], print)
+
+
+def test_single_scattering_is_refused(studio):
+    single = sj.SingleScattering(sj.load_medium("marble"))
+    material = dataclasses.replace(studio.own.material, single_scattering=single)
+    scene = dataclasses.replace(studio.own, material=material)
+    with pytest.raises(ValueError, match="has single scattering"):
+        Session(scene, studio.camera(studio.start), [0, 0, 0])
+
+
+# Of viser and of the libraries that it stands on.
+VISER = pytest.mark.filterwarnings("default")
+PATIENCE = 240  # s, in which programs are compiled
+# Levels of 255, of the mean: JPEG, and the browser's scaling.
+SHOWN = 6.0
 # Levels of 255: rounding.
 SAME = 1
 # The mean of a picture of 375 splats and 16 x 16 pixels.
@@ -235,3 +396,34 @@ def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp
     difference = searching._compared.image[:, SIDE:].astype(int) - 128
     assert np.abs(difference).max() <= 1
     searching.close()
+
+
+@VISER
+def test_a_browser_orbits_drags_and_saves(page, tmp_path):
+    playwright = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("there is no chromium")
+    start, image = page._place, page._image
+    with playwright.sync_playwright() as driver:
+        flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = driver.chromium.launch(executable_path=chromium, args=flags)
+        window = browser.new_page(viewport={"width": 900, "height": 500})
+        window.goto(page.url)
+        window.wait_for_selector("text=turn lights")
+        wait_until(lambda: page._image.size == (SIDE, SIDE) and page._status.content == "")
+        window.wait_for_timeout(3000)
+        picture = Image.open(io.BytesIO(window.screenshot())).convert("RGB")
+        middle = picture.crop((200, 0, 700, 500)).resize((SIDE, SIDE), Image.Resampling.BOX)
+        seen, made = (np.asarray(each, float) for each in (middle, page._image))
+        shown = np.abs(seen - made)[:, 11:34]  # between a note of viser and the panel
+        assert shown.mean() < SHOWN
+        window.mouse.move(200, 250)
+        window.mouse.down()
+        window.mouse.move(260, 250, steps=5)
+        window.mouse.up()
+        wait_until(lambda: np.abs(page._place - start).max() > 5)
+        window.get_by_role("button", name="PNG", exact=True).click()
+        wait_until(lambda: [*tmp_path.rglob("studio_000.png")])
+        browser.close()
+    assert page._image is not image
