@@ -3,8 +3,6 @@ projection, and what follows from them. Weights for given variances: against sol
 hand and by trying all subsets; those of a fit, and of layers that serve many media.
 """
 
-from itertools import combinations
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,6 +14,7 @@ import splatjax as sj
 from splatjax.fitting import (
     FixedTotalReflectance,
     FreeWeights,
+    GivenVariances,
     LeastCount,
     NonNegativeWeights,
     SharedVariances,
@@ -39,10 +38,10 @@ HELD = NonNegativeWeights(FixedTotalReflectance())
 MARBLE = Dipole(sj.load_medium("marble"))
 
 
-def of_fit(spread, weights):
+def of_fit(spread, weights, start=None):
     def fit(point):
         dipole = Dipole(Medium(*jnp.exp(point).reshape(3, 2)))
-        fitted = fit_gaussians(dipole, 3, spread=spread, weights=weights)
+        fitted = fit_gaussians(dipole, 3, spread=spread, weights=weights, start=start)
         logarithms = jnp.log(fitted.gaussians.variances).ravel()
         return jnp.concatenate([logarithms, fitted.gaussians.weights.ravel(), fitted.error])
 
@@ -63,7 +62,7 @@ def of_weights(point):
 KETCHUP = np.log([0.061, 0.97, 0.18, 0.07, 1.3, 1.3])
 MARBLE_RED_AND_BLUE = np.log([0.0021, 0.0071, 2.19, 3.0, 1.5, 1.5])
 REFITTED = {
-    "shared": (of_fit(SharedVariances(), HELD), KETCHUP, jax.jacfwd),
+    "shared": (of_fit(SharedVariances(), HELD, GivenVariances([0.3, 5, 26])), KETCHUP, jax.jacfwd),
     "per channel": (
         of_fit(VariancesPerChannel(), FreeWeights()),
         MARBLE_RED_AND_BLUE,
@@ -92,7 +91,8 @@ def test_derivative_of_a_fit_is_that_of_refits(float64, case):
         assert np.sum(np.asarray(values) == 0) >= 1
         single = slopes_and_values(jnp.asarray(point, jnp.float32))[0]
         assert single.dtype == jnp.float32
-        np.testing.assert_allclose(single, found, rtol=IN_FLOAT32)
+        # All but the errors.
+        np.testing.assert_allclose(single[:-2], found[:-2], rtol=IN_FLOAT32)
 
 
 @pytest.mark.slow
@@ -232,46 +232,32 @@ def test_the_least_count_that_reaches_an_error(float64):
 SOLVED = 1e-9
 
 
-def problem(seed: int):
+@eqx.filter_jit
+def solve(weights, basis, target, energies):
+    given = map(jnp.asarray, (basis, target, energies, 1.3))
+    return weights.solve(*given)[0]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_non_negative_weights_are_the_best(float64, seed):
+    """Those of Lawson and Hanson; and for a held sum, those of Kuhn and Tucker's conditions."""
     noise = np.random.default_rng(seed)
     x = np.linspace(-2, 2, 40)[:, None]
     basis = np.exp(-((x - np.linspace(-1.5, 1.5, 6)) ** 2))
     basis /= np.linalg.norm(basis, axis=0)
-    target = noise.normal(size=40)
-    return basis, target / np.linalg.norm(target), noise.uniform(0.5, 2, 6), 1.3
-
-
-@eqx.filter_jit
-def solve(weights, basis, target, energies, total):
-    return weights.solve(*map(jnp.asarray, (basis, target, energies, total)))[0]
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_non_negative_weights_are_those_of_lawson_and_hanson(float64, seed):
-    basis, target, energies, total = problem(seed)
-    found = solve(NonNegativeWeights(), basis, target, energies, total)
+    target, energies = noise.normal(size=40), noise.uniform(0.5, 2, 6)
+    target /= np.linalg.norm(target)
+    found = solve(NonNegativeWeights(), basis, target, energies)
     np.testing.assert_allclose(found, nnls(basis, target)[0], atol=SOLVED)
     assert np.all(found >= 0)
-    assert np.any(solve(FreeWeights(), basis, target, energies, total) < 0)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_non_negative_weights_of_a_held_sum_are_the_best_of_all_subsets(float64, seed):
-    basis, target, energies, total = problem(seed)
-    best = np.inf
-    for size in range(1, 7):
-        for subset in map(list, combinations(range(6), size)):
-            # Lagrange's equations of the equality alone.
-            gram = basis[:, subset].T @ basis[:, subset]
-            edge = energies[subset]
-            system = np.block([[gram, edge[:, None]], [edge[None], np.zeros((1, 1))]])
-            weights = np.linalg.solve(system, np.append(basis[:, subset].T @ target, total))[:-1]
-            if np.all(weights >= 0):
-                best = min(best, np.linalg.norm(target - basis[:, subset] @ weights))
-    found = solve(HELD, basis, target, energies, total)
-    assert np.all(found >= 0)
-    np.testing.assert_allclose(energies @ found, total, rtol=SOLVED)
-    np.testing.assert_allclose(np.linalg.norm(target - basis @ found), best, rtol=SOLVED)
+    assert np.any(solve(FreeWeights(), basis, target, energies) < 0)
+    held = np.asarray(solve(HELD, basis, target, energies))
+    assert np.all(held >= 0)
+    np.testing.assert_allclose(energies @ held, 1.3, rtol=SOLVED)
+    gains = basis.T @ (target - basis @ held) / energies  # of a unit of the sum
+    of_used = np.mean(gains[held > 0])
+    np.testing.assert_allclose(gains[held > 0], of_used, atol=SOLVED)
+    assert np.all(gains <= of_used + SOLVED)
 
 
 def test_with_the_variances_of_a_fit_they_are_its_weights(float64):
