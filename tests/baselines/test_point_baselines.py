@@ -83,7 +83,7 @@ def test_squares_smaller_than_a_pixel_are_gray_and_still_with_a_filter_and_alias
         (np.floor(np.asarray(sheet.centers[:, :2]) / 0.25 + 0.25).sum(1) % 2)[None], float
     )
     # 48 pixels of 0.42 mm: 1.7 squares, 3.3 splats along each
-    shifts = np.linspace(0, 0.4, 3)
+    shifts = [0.0, 0.2]
     cameras = [camera((s, 0.6 * s, 75.0), fov=15.2, target=(s, 0.6 * s, 0.0)) for s in shifts]
     pictures_by = {
         name: drawn(name, sheet, checkers, *cameras)[0][:, 0, 6:-6, 6:-6] for name in RASTERIZERS
