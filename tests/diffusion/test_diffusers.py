@@ -268,22 +268,3 @@ def test_blocks_of_a_compact_order_are_small():
         even = np.sqrt(4 * np.pi * size / 4000)  # edge of a square with its share of the sphere
         assert np.median(extent) < 2 * even
         assert np.max(extent) < 5 * even
-
-
-@pytest.mark.once
-def test_neighbors_are_the_boxes_within_reach_each_once():
-    rng, reach = np.random.default_rng(3), 1.5
-    corners = (rng.uniform(-6, 6, (count, 3)) for count in (26, 104))
-    points, sources = (
-        _neighbors.Boxes(*(jnp.asarray(each, float) for each in (low, low + rng.random(low.shape))))
-        for low in corners
-    )
-    gaps = np.maximum(
-        points.low[:, None] - sources.high[None], sources.low[None] - points.high[:, None]
-    )
-    expected = np.sum(np.maximum(gaps, 0) ** 2, axis=2) <= reach**2
-    lists = _neighbors.find_neighbors(points, sources, np.zeros(104, int), [reach])
-    lists = jax.tree.map(np.asarray, lists)
-    for block, near in enumerate(expected):
-        row = lists.rows[lists.first[block] :][: lists.counts[block]].reshape(-1)
-        np.testing.assert_array_equal(np.sort(row[row < 104]), np.flatnonzero(near))
