@@ -150,6 +150,7 @@ def all_channels() -> Dipole:
     )
 
 
+@pytest.mark.once
 @pytest.mark.parametrize(
     ("chosen", "most", "shared"),
     [
@@ -157,7 +158,7 @@ def all_channels() -> Dipole:
         pytest.param(slice(None), 8, ["free", "held"], marks=pytest.mark.long),
     ],
 )
-def test_sums_of_gaussians_reach_the_best_known_errors(float64, chosen, most, shared):
+def test_sums_of_gaussians_reach_the_best_known_errors(double, chosen, most, shared):
     """Of 12 media, or of ketchup and spectralon: per channel, shared by the channels, and so with
     non-negative weights of a held sum.
     """
