@@ -83,7 +83,7 @@ def test_squares_smaller_than_a_pixel_are_gray_and_still_with_a_filter_and_alias
         (np.floor(np.asarray(sheet.centers[:, :2]) / 0.25 + 0.25).sum(1) % 2)[None], float
     )
     # 48 pixels of 0.42 mm: 1.7 squares, 3.3 splats along each
-    shifts = np.linspace(0, 0.4, 3)
+    shifts = [0.0, 0.2]
     cameras = [camera((s, 0.6 * s, 75.0), fov=15.2, target=(s, 0.6 * s, 0.0)) for s in shifts]
     pictures_by = {
         name: drawn(name, sheet, checkers, *cameras)[0][:, 0, 6:-6, 6:-6] for name in RASTERIZERS
@@ -110,48 +110,28 @@ def test_squares_smaller_than_a_pixel_are_gray_and_still_with_a_filter_and_alias
 
 @pytest.mark.once
 @pytest.mark.parametrize("name", RASTERIZERS)
-def test_a_plane_of_one_color_has_exactly_that_color_and_lies_where_it_lies(name):
-    sheet, color = bodies.sheet(9.0, 0.8, jitter=0.3), 0.7
-    seen = camera((4.0, -9.0, 14.0), fov=20.0)
-    view = sj.splatting.PerspectiveView.of(seen)
-    rows = jnp.full((1, sheet.count), color)
-    attributes, coverage, depth = seen_by(name, sheet, view)(sheet, rows, view)
-    inside = np.asarray(coverage) > 0
-    assert inside.mean() > 0.95
-    np.testing.assert_allclose(np.asarray(attributes[..., 0])[inside], color, rtol=1e-5)
+def test_a_plane_has_its_color_lies_where_it_lies_and_hides_what_is_behind(name):
+    """Its attributes are one color, and one of its own for each splat: elliptical points show these
+    alone, blended ones show more.
+    """
+    near = bodies.sheet(9.0, 0.8, jitter=0.3)
+    far = dataclasses.replace(near, centers=near.centers - jnp.asarray([[0.0, 0.0, 8.0]]))
+    view = sj.splatting.PerspectiveView.of(camera((4.0, -9.0, 14.0), fov=20.0))
+    own, color = np.random.default_rng(0).uniform(size=near.count), 0.7
+    rows = np.stack([np.full(near.count, color), own])
+    rows, body = np.concatenate([0 * rows, rows], axis=1), bodies.joined(far, near)
+    attributes, coverage, depth = seen_by(name, body, view)(body, jnp.asarray(rows, float), view)
+    assert np.all(coverage > 0)
+    np.testing.assert_allclose(attributes[..., 0], color, rtol=1e-5)
+    colors = np.ravel(attributes[..., 1])
+    nearest = np.min(np.abs(colors[:, None] - own[None].astype(colors.dtype)), axis=1)
+    share = np.mean(nearest < 1e-6)
+    assert share == 1 if name == "elliptical" else share < 0.2
+    assert colors.min() >= own.min() - 1e-6
+    assert colors.max() <= own.max() + 1e-6
     y, x = np.mgrid[:SIZE, :SIZE] + 0.5
     points = view.unproject(jnp.asarray(x, float), jnp.asarray(y, float), depth)
-    np.testing.assert_allclose(np.asarray(points[2])[inside], 0.0, atol=2e-3)
-
-
-@pytest.mark.once
-@pytest.mark.parametrize("name", RASTERIZERS)
-def test_what_is_nearer_hides_what_is_behind(name):
-    near = bodies.sheet(6.0, 1.0, jitter=0.2)
-    far = dataclasses.replace(near, centers=near.centers - jnp.asarray([[0.0, 0.0, 8.0]]))
-    colors = jnp.concatenate([jnp.zeros((1, far.count)), jnp.ones((1, near.count))], axis=1)
-    seen, covered = drawn(
-        name, bodies.joined(far, near), colors, camera((0.0, 0.0, 20.0), fov=20.0)
-    )
-    assert np.all(covered > 0)
-    np.testing.assert_allclose(seen, 1.0, rtol=1e-6)
-
-
-@pytest.mark.once
-def test_elliptical_points_have_one_color_each_and_blended_ones_more():
-    sheet = bodies.sheet(6.0, 1.5, jitter=0.2)
-    own = np.random.default_rng(0).uniform(size=(1, sheet.count))
-    seen = camera((0.0, 3.0, 20.0), fov=25.0)
-    shares = {}
-    for name in RASTERIZERS:
-        colors, covered = drawn(name, sheet, jnp.asarray(own, float), seen)
-        colors = colors[0, 0][covered[0] > 0]
-        nearest = np.min(np.abs(colors[:, None] - own[0][None].astype(colors.dtype)), axis=1)
-        shares[name] = np.mean(nearest < 1e-6)
-        assert colors.min() >= own.min() - 1e-6
-        assert colors.max() <= own.max() + 1e-6
-    assert shares["elliptical"] == 1
-    assert all(shares[name] < 0.2 for name in BLENDING)
+    np.testing.assert_allclose(points[2], 0.0, atol=2e-3)
 
 
 @pytest.mark.once
@@ -232,7 +212,7 @@ def test_a_baseline_renders_what_the_renderer_does_with_scattering_and_shadow():
         )  # of radiance up to 1; most of it where the light grazes
 
 
-@pytest.mark.parametrize("name", RASTERIZERS)
+@pytest.mark.parametrize("name", ["elliptical", "ewa", "deferred"])
 def test_what_is_blended_has_derivatives(name, float64):
     """Of what the splats carry and of where they are, as far as no fragment comes or goes: against
     differences.
@@ -245,14 +225,15 @@ def test_what_is_blended_has_derivatives(name, float64):
     direction = jnp.asarray(np.random.default_rng(5).normal(size=sheet.centers.shape))
 
     @jax.jit
+    @jax.value_and_grad
     def total(step):
         moved = dataclasses.replace(sheet, centers=sheet.centers + step * direction)
         attributes, _, depth = draw(moved, rows * (1 + step), view)
         return jnp.sum(turn * attributes[..., 0]) + jnp.sum(turn * depth)
 
     step = 1e-8  # a longer one changes which splat some pixel shows
-    expected = (total(step) - total(-step)) / (2 * step)
-    np.testing.assert_allclose(jax.jit(jax.grad(total))(0.0), expected, rtol=1e-3)
+    expected = (total(step)[0] - total(-step)[0]) / (2 * step)
+    np.testing.assert_allclose(total(0.0)[1], expected, rtol=1e-3)
 
 
 FACTOR = 1.5  # what the law is held to

@@ -19,7 +19,7 @@ SIZE, HALF = 128, 12.0
 TWO = sj.SumOfGaussians(
     jnp.asarray([0.3, 2.0], float), jnp.asarray([[0.5, 0.4, 0.3], [0.5, 0.6, 0.7]], float)
 )
-ONE = sj.SumOfGaussians(jnp.asarray([1.0], float), jnp.ones((1, 3)))
+ONE = sj.SumOfGaussians(jnp.full(2, 1.0), jnp.full((2, 3), 0.5))  # in two halves
 CAMERA = camera_over(HALF, SIZE)
 INSIDE = slice(SIZE // 4, -SIZE // 4)
 

@@ -60,7 +60,7 @@ def off_by(stretch: float, correction: baselines.AbstractStretch) -> float:
 @pytest.mark.parametrize(
     ("stretch", "correction", "least", "most"),
     [
-        (1.0, baselines.StretchCorrected(), 0, 2e-3),  # 1.4e-3
+        pytest.param(1.0, baselines.StretchCorrected(), 0, 2e-3, marks=pytest.mark.long),  # 1.4e-3
         (3.0, baselines.StretchCorrected(), 0, 1e-2),  # 7.6e-3: texels are 3 times as long
         (3.0, baselines.Uncorrected(), 5e-2, 1),  # 1.1e-1
     ],
@@ -69,21 +69,17 @@ def test_on_a_plane_it_is_splat_diffusion_if_stretch_is_corrected(stretch, corre
     assert least < off_by(stretch, correction) < most
 
 
-@pytest.fixture(scope="module")
-def sheet():
-    mesh = baselines.TexturedMesh.of(plane(2.0))
-    settings = dataclasses.replace(THIN, resolution=64)
-    lights = (dataclasses.replace(FRONTAL, cast_shadows=True),)
-    camera = bodies.camera_over(15.0, 32)
-    plan = baselines.plan_texture_space(mesh, lights, DULL, camera, settings)
-    return mesh, lights, camera, settings, plan
+SHEET = baselines.TexturedMesh.of(plane(2.0))
+LIGHTS = (dataclasses.replace(FRONTAL, cast_shadows=True),)
+OVER = bodies.camera_over(15.0, 32)
 
 
 @pytest.mark.once
 @pytest.mark.long
-def test_constant_light_stays_constant_up_to_the_edges(sheet):
-    mesh, lights, camera, settings, plan = sheet
-    found = baselines.render_texture_space(mesh, lights, DULL, camera, settings, plan)
+def test_constant_light_stays_constant_up_to_the_edges():
+    settings = dataclasses.replace(THIN, resolution=64)
+    plan = baselines.plan_texture_space(SHEET, LIGHTS, DULL, OVER, settings)
+    found = baselines.render_texture_space(SHEET, LIGHTS, DULL, OVER, settings, plan)
     on_chart = np.asarray(found.texture.layers)[:, np.asarray(found.texture.valid) > 0]
     np.testing.assert_allclose(on_chart, 1.0, atol=1e-5)
     frame = found.frame
@@ -110,11 +106,10 @@ def test_beyond_its_capacity_the_picture_is_nan():
 
 
 @pytest.mark.once
-def test_bad_input_is_refused(sheet):
-    mesh, lights, camera, settings, _ = sheet
+def test_bad_input_is_refused():
     bare, lamp = plane(1.0), sj.PointLight(jnp.asarray([0.0, 0.0, 2.0]), jnp.ones(3))
     beyond = bare.uvs * [1.0, 2.0] + [0.0, 0.05]
-    render = jax.jit(lambda mesh: baselines.render_texture_space(mesh, lights, DULL, camera))
+    render = jax.jit(lambda mesh: baselines.render_texture_space(mesh, LIGHTS, DULL, OVER))
     for refused, message in (
         (
             lambda: baselines.TexturedMesh.of(
@@ -127,10 +122,10 @@ def test_bad_input_is_refused(sheet):
             r"0.05 to 1.95",
         ),
         (
-            lambda: baselines.plan_texture_space(mesh, (lamp,), DULL, camera, settings),
+            lambda: baselines.plan_texture_space(SHEET, (lamp,), DULL, OVER, THIN),
             r"lights\[0\] is 2 mm",
         ),
-        (lambda: render(mesh), "plan"),
+        (lambda: render(SHEET), "plan"),
     ):
         bodies.assert_refused(refused, message)
 
@@ -215,6 +210,11 @@ def corners():
 
 @pytest.mark.once
 def test_a_slanted_plane_is_seen_where_its_rays_meet_it_and_has_no_cracks(corners):
+    """It hides what is behind; backs, and faces before the eye, are not drawn."""
+    farther = 0.5 * corners - jnp.asarray([[[0.0, 0.0, 2.0]]])
+    back = corners[:, ::-1] + jnp.asarray([[[0.0, 0.0, 4.0]]])
+    behind = corners[:1].at[0, 0].set(jnp.asarray([6.0, -9.0, 30.0]))
+    corners = jnp.concatenate([farther, corners, back, behind])
     landing, seen = seen_from(CAMERA, corners)
     positions = baselines.interpolate(corners, seen, baselines.barycentrics(landing, seen))
     expected, covered = bodies.hits(CAMERA), np.asarray(seen.covered)
@@ -223,19 +223,6 @@ def test_a_slanted_plane_is_seen_where_its_rays_meet_it_and_has_no_cracks(corner
     np.testing.assert_allclose(np.asarray(positions)[covered], expected[covered], atol=2e-4)
     assert float(seen.needed) <= 1
     assert float(baselines.see_faces(landing, 100).needed) > 1
-
-
-@pytest.mark.once
-def test_the_nearest_face_hides_the_others_and_backs_and_faces_before_the_eye_are_not_drawn(
-    corners,
-):
-    nearer = corners + jnp.asarray([0.0, 0.0, 2.0])[None, None]
-    back = corners[:, ::-1] + jnp.asarray([0.0, 0.0, 4.0])[None, None]
-    behind = corners[:1].at[0, 0].set(jnp.asarray([6.0, -9.0, 30.0]))
-    _, seen = seen_from(CAMERA, jnp.concatenate([corners, nearer, back, behind]))
-    faces = np.asarray(seen.faces)[np.asarray(seen.covered)]
-    assert np.all(faces < 2 * len(corners))
-    assert np.asarray(seen.faces)[PIXELS // 2, PIXELS // 2] >= len(corners)
 
 
 @pytest.mark.once
@@ -264,7 +251,7 @@ def test_attributes_have_the_derivatives_that_differences_say(float64, corners):
         picture,
         (corners, values, CAMERA.focal_length.astype(float)),
         order=1,
-        modes=["fwd", "rev"],
+        modes=["rev"],
         rtol=1e-6,
         atol=1e-6,
     )

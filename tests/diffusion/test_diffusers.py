@@ -115,12 +115,15 @@ def by_formula(sources, variances, largest):
     return jnp.stack(found)
 
 
+@pytest.mark.once
 def test_plain_integral_is_the_formula():
-    expected = by_formula(scene()[1], jnp.asarray(VARIANCES), jnp.full(3, jnp.inf))
+    largest = jnp.full(3, jnp.inf)
+    expected = jax.jit(by_formula)(scene()[1], jnp.asarray(VARIANCES), largest)
     scale = np.max(np.abs(expected), axis=(1, 3), keepdims=True)
     np.testing.assert_allclose(stacked(plain()) / scale, expected / scale, atol=2e-5)
 
 
+@pytest.mark.once
 @pytest.mark.parametrize(("error", "at_once"), [(0.0, 40), (2e-3, 1 << 13)])
 def test_fast_diffuser_is_the_plain_one_within_its_stated_error(error, at_once, monkeypatch):
     """And both keep constants, are linear, and lie between the least and the greatest light. What
@@ -150,6 +153,7 @@ def test_fast_diffuser_is_the_plain_one_within_its_stated_error(error, at_once, 
             assert high < HIGH, where
 
 
+@pytest.mark.once
 def test_the_two_faces_of_a_thin_sheet_are_not_merged():
     """Their sources lie below each, on either side of the other: one cluster for both is off by a
     twentieth.
@@ -199,7 +203,8 @@ def test_gradients_are_those_of_the_plain_sum_over_the_sources_within_the_suppor
     _, derivative = jax.jit(
         lambda *given: plan.diffuse_with_derivative(*given, KERNEL, DeviceMesh())
     )(sources, variances)
-    _, expected = jax.jvp(lambda v: within_support(sources, v), (variances,), (variances,))
+    of_variances = jax.jit(lambda v: jax.jvp(lambda v: within_support(sources, v), (v,), (v,))[1])
+    expected = of_variances(variances)
     scale = GRADIENT * float(jnp.max(jnp.abs(expected)))
     np.testing.assert_allclose(stacked(derivative.layers), expected, atol=scale)
 
@@ -223,6 +228,7 @@ def test_gradients_through_clusters_are_those_of_differences(float64):
     check_grads(total, given, 1, ["rev"], atol=DIFFERENCES, rtol=DIFFERENCES, eps=1e-6)
 
 
+@pytest.mark.once
 def test_far_from_every_source_gradients_are_finite():
     """As in an unresolved layer: nothing reaches a point between splats."""
     _, sources = scene(8 * POINTS_PER_BLOCK)
@@ -236,6 +242,7 @@ def test_far_from_every_source_gradients_are_finite():
         assert np.isfinite(jax.jit(jax.grad(total))(jnp.asarray(variance)))
 
 
+@pytest.mark.once
 def test_outside_its_plan_the_diffuser_reports_it():
     body, sources = scene(8 * POINTS_PER_BLOCK)
     plan = planned(ClusterDiffuser(), body)
@@ -250,6 +257,7 @@ def test_outside_its_plan_the_diffuser_reports_it():
         assert needed(*outside) > 1, outside
 
 
+@pytest.mark.once
 def test_blocks_of_a_compact_order_are_small():
     points = bodies.unit(np.random.default_rng(1).normal(size=(4000, 3)))
     order = compact_order(points)
@@ -260,21 +268,3 @@ def test_blocks_of_a_compact_order_are_small():
         even = np.sqrt(4 * np.pi * size / 4000)  # edge of a square with its share of the sphere
         assert np.median(extent) < 2 * even
         assert np.max(extent) < 5 * even
-
-
-def test_neighbors_are_the_boxes_within_reach_each_once():
-    rng, reach = np.random.default_rng(3), 1.5
-    corners = (rng.uniform(-6, 6, (count, 3)) for count in (26, 104))
-    points, sources = (
-        _neighbors.Boxes(*(jnp.asarray(each, float) for each in (low, low + rng.random(low.shape))))
-        for low in corners
-    )
-    gaps = np.maximum(
-        points.low[:, None] - sources.high[None], sources.low[None] - points.high[:, None]
-    )
-    expected = np.sum(np.maximum(gaps, 0) ** 2, axis=2) <= reach**2
-    lists = _neighbors.find_neighbors(points, sources, np.zeros(104, int), [reach])
-    lists = jax.tree.map(np.asarray, lists)
-    for block, near in enumerate(expected):
-        row = lists.rows[lists.first[block] :][: lists.counts[block]].reshape(-1)
-        np.testing.assert_array_equal(np.sort(row[row < 104]), np.flatnonzero(near))

@@ -98,6 +98,7 @@ def test_the_kernel_falls_to_zero_without_a_step(support, float64):
     bodies.assert_close(in_float32, (weight, fall), atol=IN_FLOAT32)
 
 
+@pytest.mark.once
 def test_what_lies_beyond_the_support_is_half_of_the_error():
     for error, share in ((2e-3, 1.0), (2e-3, 0.1), (1e-2, 1.0), (0.0, 1.0)):
         beyond = np.exp(-0.5 * KERNEL.support(error, share) ** 2)
@@ -118,6 +119,7 @@ def test_resolved_fraction_rises_smoothly_from_none_to_all(float64):
     assert np.max(np.abs(np.diff(slopes))) < bend * 1.01 * 1.4 / 1400, "the slope jumps"
 
 
+@pytest.mark.once
 def test_unevenness_distinguishes_grids_from_scattered_splats(dtype):
     assert float(unevenness(bodies.sheet(10.0, 0.5))) < 1e-3
     assert float(unevenness(bodies.sheet(10.0, 0.5, jitter=0.25))) > 0.1
@@ -136,12 +138,14 @@ def test_unevenness_distinguishes_grids_from_scattered_splats(dtype):
         np.testing.assert_allclose(found, interval, rtol=1e-6)
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("mass", [0.0, 0.4, 1.0])
 def test_flat_pieces_and_open_edges_keep_their_mean(mass):
     np.testing.assert_array_equal(gains(mass, WEIGHTS), 1)
     np.testing.assert_array_equal(gains(mass + 2, WEIGHTS, VARIANCES, 0.0, PlainMean()), 1)
 
 
+@pytest.mark.once
 def test_what_absorbs_nothing_returns_all_whatever_the_shape():
     for mass in (3.0, np.linspace(1.1, 2.5, 6)):
         np.testing.assert_allclose(returned(mass, WHITE), 1, rtol=1e-5)
@@ -152,6 +156,7 @@ def test_what_absorbs_nothing_returns_all_whatever_the_shape():
     assert np.all(returned(2.5, rest, [1.0, 4.0]) > 1.01 * (1 - once))
 
 
+@pytest.mark.once
 def test_nothing_returns_more_than_it_receives_and_more_mass_lets_out_more():
     rng = np.random.default_rng(4)
     for _ in range(20):
@@ -165,11 +170,13 @@ def test_nothing_returns_more_than_it_receives_and_more_mass_lets_out_more():
     assert np.all(darker > gains(2.0, WEIGHTS)), "the darker gains more of what it would lose"
 
 
+@pytest.mark.once
 def test_a_layer_wider_than_its_body_gains_as_the_narrower_ones():
     ours, theirs = (gains([1, 1, 1, 1.2, 1.5, mass], WEIGHTS) for mass in (0.3, 1.5))
     np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("radius", list(SPHERES))
 def test_spheres_return_what_walks_do(radius):
     """Under even light, over what a flat surface returns."""
@@ -186,6 +193,7 @@ def test_spheres_return_what_walks_do(radius):
     np.testing.assert_allclose(gained, SPHERES[radius], rtol=0.08 if radius < 15 else 0.045)
 
 
+@pytest.mark.once
 def test_layers_need_no_order_and_negative_weights_count_as_none():
     mass = np.linspace(1.1, 2.5, 6)
     turned = gains(mass[::-1], WEIGHTS[::-1], VARIANCES[::-1])
@@ -195,6 +203,7 @@ def test_layers_need_no_order_and_negative_weights_count_as_none():
     np.testing.assert_allclose(ours, theirs, rtol=1e-6)
 
 
+@pytest.mark.once
 def test_gradients_at_the_corners_are_the_limits():
     """At weights of zero the limit from above, at no weights at all finite, at a mass of one
     rounded.
@@ -230,6 +239,7 @@ def sheet_at_origin(thickness, half, spacing, light, variances, kernel) -> jax.A
     )
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("thickness", list(THROUGH))
 def test_sheets_let_through_what_walks_say(thickness):
     """Far better than the mean over the splats, which loses from a third to three quarters of
@@ -249,6 +259,7 @@ def test_sheets_let_through_what_walks_say(thickness):
     assert np.all(off[0] < 0.35 * off[1]), off
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("interval", [(0.1, 0.2), (0.5, 3.0), (1.0, 5.0)])
 def test_a_thin_white_sheet_returns_what_it_receives_whatever_is_resolved(interval):
     spacing, variances = 0.5, jnp.asarray([0.3, 1.0, 4.0])
@@ -264,6 +275,7 @@ def test_a_thin_white_sheet_returns_what_it_receives_whatever_is_resolved(interv
     assert 0.5 < float(grey[0, 0]) < 1
 
 
+@pytest.mark.once
 def test_a_linear_layer_is_continued_exactly_whatever_the_weights():
     """Half of the slope of each splat, and half of the mean slope from the mean center."""
     rng = np.random.default_rng(3)
@@ -304,6 +316,7 @@ def layers_at_points(kernel):
     return at, sj.SumOfGaussians(variances, jnp.asarray(weights))
 
 
+@pytest.mark.once
 def test_unresolved_layers_are_the_irradiance_of_the_surface():
     """In between, the mass is counted by the fraction that is resolved."""
     at, gaussians = layers_at_points(EscapeNormalization())

@@ -44,10 +44,17 @@ def beams(splats: sj.Splats, direction=DOWN, channels: int = 2) -> Beams:
     return Beams(jnp.tile(irradiance, (channels, 1)), directions)
 
 
-def solved(splats: sj.Splats, medium: sj.Medium, beams: Beams, error: float = 1e-4, opening=0.0):
+@eqx.filter_jit
+def exitance_of(diffuser, splats, medium, beams, hierarchy, even):
+    return diffuser.radiant_exitance(splats, medium, beams, hierarchy, even)
+
+
+def solved(
+    splats: sj.Splats, medium: sj.Medium, beams: Beams, error: float = 1e-4, opening=0.0, even=0.0
+) -> np.ndarray:
     diffuser = ShapeDiffuser(error, opening)
-    given = splats, medium, beams, diffuser.find_hierarchy(splats)
-    return eqx.filter_jit(diffuser.radiant_exitance)(*given)
+    hierarchy, even = diffuser.find_hierarchy(splats), jnp.full((2, splats.count), even)
+    return np.asarray(exitance_of(diffuser, splats, medium, beams, hierarchy, even))
 
 
 def angles(splats: sj.Splats) -> np.ndarray:
@@ -61,7 +68,7 @@ def sphere() -> sj.Splats:
 
 @pytest.fixture(scope="module")
 def exitance(sphere) -> np.ndarray:
-    return np.asarray(solved(sphere, medium(), beams(sphere)))
+    return solved(sphere, medium(), beams(sphere))
 
 
 @pytest.mark.once
@@ -80,7 +87,7 @@ SLABS = {2.0: [[0.4787, 0.3616], [0.3148, 0.2212]], 4.0: [[0.6054, 0.4081], [0.2
 
 
 @pytest.mark.once
-@pytest.mark.parametrize("depth", [2.0, 4.0])
+@pytest.mark.parametrize("depth", [2.0, pytest.param(4.0, marks=pytest.mark.long)])
 def test_a_slab_returns_and_lets_through_what_light_transport_does(depth):
     box = trimesh.creation.box([20, 20, depth])
     vertices = np.asarray(box.vertices)[box.faces].reshape(-1, 3)
@@ -90,15 +97,16 @@ def test_a_slab_returns_and_lets_through_what_light_transport_does(depth):
     splats = splats.take(jnp.asarray(compact_order(np.asarray(splats.centers))))
     albedo = np.asarray([0.98, 0.9])
     of_slab = sj.Medium(1 - albedo, albedo, np.ones(2))
-    exitance = np.asarray(solved(splats, of_slab, beams(splats), opening=0.25))
+    exitance = solved(splats, of_slab, beams(splats), opening=0.25)
     is_inner = np.all(np.abs(splats.centers[:, :2]) < 3, axis=1)
     for side, expected in zip((1, -1), SLABS[depth], strict=True):
         mean = exitance[:, is_inner & (side * splats.normals[:, 2] > 0.5)].mean(axis=1)
         np.testing.assert_allclose(mean, expected, rtol=0.025)
 
 
+@pytest.mark.once
 def test_a_sphere_that_absorbs_nothing_loses_what_it_does_not_scatter(sphere):
-    exitance = np.asarray(solved(sphere, medium(np.ones(2)), beams(sphere)))
+    exitance = solved(sphere, medium(np.ones(2)), beams(sphere))
     total = exitance @ np.asarray(sphere.areas) / (np.pi * RADIUS**2)
     # Light that crosses 2 R mu unscattered: 2 int exp(-2 R sigma_t mu) mu dmu.
     across = 2 * RADIUS * SIGMA_T
@@ -136,6 +144,7 @@ def off(found, expected) -> float:
     return float(jnp.sqrt(jnp.mean((found - expected) ** 2) / jnp.mean(expected**2)))
 
 
+@pytest.mark.once
 def test_the_size_of_body_and_coefficients_does_not_matter(sphere, exitance):
     larger, usual = sphere.scaled(1e4), medium()
     thinner = sj.Medium(usual.sigma_a / 1e4, usual.sigma_s_prime / 1e4, usual.eta)
@@ -190,7 +199,7 @@ def test_the_solution_on_a_sphere_converges_to_the_series():
     errors = []
     for count in (500, 2000):
         splats = bodies.sphere(count, RADIUS, jitter=0.0)
-        exitance = np.asarray(solved(splats, medium(), beams(splats), 1e-6))
+        exitance = solved(splats, medium(), beams(splats), 1e-6)
         series = np.stack([diffused_on_sphere(a, np.radians(angles(splats))) for a in ALBEDO])
         is_even = np.abs(angles(splats) - 45) < 25  # away from the points' poles and the terminator
         errors.append(np.abs(exitance - series)[:, is_even].max() / series.max())
@@ -200,15 +209,14 @@ def test_the_solution_on_a_sphere_converges_to_the_series():
 
 @pytest.mark.once
 def test_a_white_body_returns_even_light(sphere):
-    none, even = jax.tree.map(jnp.zeros_like, beams(sphere)), jnp.ones((2, SPLATS))
-    diffuser = ShapeDiffuser()
-    given = sphere, medium(np.asarray([1.0, 0.95]), 1.4), none, diffuser.find_hierarchy(sphere)
-    white, dark = np.asarray(eqx.filter_jit(diffuser.radiant_exitance)(*given, even))
+    none = jax.tree.map(jnp.zeros_like, beams(sphere))
+    white, dark = solved(sphere, medium(np.asarray([1.0, 0.95]), 1.4), none, even=1.0)
     np.testing.assert_allclose(white, 1, atol=2e-3)
     assert np.all(dark < 1)
     assert np.ptp(dark) < 0.01
 
 
+@pytest.mark.once
 def test_refused_bodies_and_materials(sphere):
     half = jax.tree.map(lambda leaf: leaf[: SPLATS // 2], sphere)
     bodies.assert_refused(lambda: ShapeDiffuser().find_hierarchy(half), "close the mesh")

@@ -25,7 +25,7 @@ from splatjax.fitting import (
     squared_error,
 )
 from splatjax.fitting._problem import make_problem
-from splatjax.fitting._search import greedy_path, refine
+from splatjax.fitting._search import refine
 from splatjax.scattering import (
     L2_QUADRATURE,
     Dipole,
@@ -92,30 +92,21 @@ def test_errors_of_eq_3_and_eq_4_in_closed_form(float64):
     np.testing.assert_allclose(relative_error(one, sj.SumOfGaussians([0.5], [0])), [1], rtol=1e-12)
 
 
-def test_a_fit_reports_eq_4_and_energy_and_more_gaussians_fit_better(float64):
-    profile, errors = media("marble"), []
-    for count in (4, 6):
-        fitted = fit_gaussians(profile, count)
-        variances, energy = fitted.gaussians.variances, fitted.gaussians.total_reflectance()
-        assert variances.shape == (count,)
-        assert np.all(np.diff(variances) > 0)
-        assert bool(fitted.result == optx.RESULTS.successful)
-        eq_4 = relative_error(profile, fitted.gaussians)
-        np.testing.assert_allclose(eq_4, fitted.error, rtol=1e-9)
-        energy_error = energy / profile.total_reflectance() - 1
-        np.testing.assert_allclose(fitted.energy_error, energy_error, atol=1e-12)
-        errors.append(together(fitted.error))
-    assert errors[0] > 4 * errors[1]
-
-
-def test_held_energy_is_held_at_little_cost(float64):
+def test_a_fit_reports_its_errors_and_held_energy_is_held_at_little_cost(float64):
     profile = media("marble")
     free = fit_gaussians(profile, 4)
-    held = fit_gaussians(profile, 4, weights=FixedTotalReflectance())
+    near = GivenVariances(1.1 * free.gaussians.variances)
+    assert np.all(np.diff(free.gaussians.variances) > 0)
+    assert bool(free.result == optx.RESULTS.successful)
+    eq_4 = relative_error(profile, free.gaussians)
+    np.testing.assert_allclose(eq_4, free.error, rtol=1e-9)
+    energy_error = free.gaussians.total_reflectance() / profile.total_reflectance() - 1
+    np.testing.assert_allclose(free.energy_error, energy_error, atol=1e-12)
+    held = fit_gaussians(profile, 4, weights=FixedTotalReflectance(), start=near)
     assert np.max(np.abs(held.energy_error)) < HELD
     assert np.max(np.abs(free.energy_error)) > 0.01
     assert together(free.error) < together(held.error) < 1.5 * together(free.error)
-    own = fit_gaussians(profile, 4, spread=VariancesPerChannel())
+    own = fit_gaussians(profile, 4, spread=VariancesPerChannel(), start=near)
     assert np.all(np.asarray(own.error) < np.asarray(free.error))
     # A notebook shows the numbers of the fit.
     rows = [[float(number) for number in row.split()] for _, row in free.table()[1:]]
@@ -123,12 +114,19 @@ def test_held_energy_is_held_at_little_cost(float64):
     np.testing.assert_allclose(rows[5], free.error, rtol=0.01)
     counts = [fitted._repr_html_().count("<tr>") for fitted in (free, own)]
     assert counts == [1 + 4 + 3, 1 + 3 * 4 + 3]
-    # Each channel stands alone: green is fitted as if there were no other.
+    # Each channel stands alone: green is fitted as if there were no other. The four Gaussians are
+    # published.
     thrice = jax.tree.map(lambda leaf: jnp.full_like(leaf, leaf[1]), profile)
-    green = fit_gaussians(thrice, 4).gaussians
-    np.testing.assert_allclose(own.gaussians.variances[1], green.variances, rtol=SAME_OPTIMUM)
+    green = fit_gaussians(thrice, 4)
+    assert float(green.error[0]) <= 0.0126
+    variances, weights = [0.0363, 0.1461, 0.9114, 7.010], [0.0704, 0.1839, 0.2060, 0.2882]
+    published = sj.SumOfGaussians(variances, np.repeat(np.c_[weights], 3, axis=1))
+    assert_close(green.gaussians, published, rtol=PUBLISHED)
     np.testing.assert_allclose(
-        own.gaussians.weights[1, :, 0], green.weights[:, 1], rtol=SAME_OPTIMUM
+        own.gaussians.variances[1], green.gaussians.variances, rtol=SAME_OPTIMUM
+    )
+    np.testing.assert_allclose(
+        own.gaussians.weights[1, :, 0], green.gaussians.weights[:, 1], rtol=SAME_OPTIMUM
     )
     # Nothing depends on the unit of length.
     medium = profile.medium
@@ -139,14 +137,10 @@ def test_held_energy_is_held_at_little_cost(float64):
     assert_close(other.gaussians, expected, rtol=SAME_OPTIMUM)
 
 
-def test_green_marble_is_the_published_fit(float64):
-    fitted = fit_gaussians(Dipole(MARBLE_GREEN, EganFresnel()), 4)
-    assert float(fitted.error[0]) <= 0.0126
-    variances, weights = [0.0363, 0.1461, 0.9114, 7.010], [0.0704, 0.1839, 0.2060, 0.2882]
-    assert_close(fitted.gaussians, sj.SumOfGaussians(variances, weights), rtol=PUBLISHED)
-
-
-HELD_ABOVE_ZERO = NonNegativeWeights(FixedTotalReflectance())
+SHARED = {
+    "free": (FreeWeights(), SHARED_FREE),
+    "held": (NonNegativeWeights(FixedTotalReflectance()), SHARED_HELD),
+}
 
 
 def all_channels() -> Dipole:
@@ -156,30 +150,38 @@ def all_channels() -> Dipole:
     )
 
 
-@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.long)])
-def test_one_to_eight_gaussians_reach_the_best_known_errors(float64, every):
-    """Of 12 media or every third: per channel, shared by the channels, and so with non-negative
-    weights of a held sum.
+@pytest.mark.once
+@pytest.mark.parametrize(
+    ("chosen", "most", "shared"),
+    [
+        (slice(4, None, 6), 5, ["held"]),
+        pytest.param(slice(None), 8, ["free", "held"], marks=pytest.mark.long),
+    ],
+)
+def test_sums_of_gaussians_reach_the_best_known_errors(double, chosen, most, shared):
+    """Of 12 media, or of ketchup and spectralon: per channel, shared by the channels, and so with
+    non-negative weights of a held sum.
     """
-    media = jax.tree.map(lambda leaf: leaf.reshape(-1, 3)[::every], all_channels())
-    own = error_by_count(jax.tree.map(jnp.ravel, media), 8, spread=VariancesPerChannel()).error
-    best = np.concatenate(list(PER_CHANNEL.values())[::every]).T
+    media = jax.tree.map(lambda leaf: leaf.reshape(-1, 3)[chosen], all_channels())
+    own = error_by_count(jax.tree.map(jnp.ravel, media), most, spread=VariancesPerChannel()).error
+    best = np.concatenate(list(PER_CHANNEL.values())[chosen]).T[:most]
     ratios = {"per channel": np.max(np.asarray(own) / best, axis=1)}
-    for name, weights, table in (
-        ("shared", FreeWeights(), SHARED_FREE),
-        ("shared, held", HELD_ABOVE_ZERO, SHARED_HELD),
-    ):
+    for name in shared:
+        weights, table = SHARED[name]
         found = eqx.filter_vmap(
-            lambda profile, weights=weights: error_by_count(profile, 8, weights=weights).error
+            lambda profile, weights=weights: error_by_count(profile, most, weights=weights).error
         )(media)
-        best = np.asarray(list(table.values())[::every])
+        best = np.asarray(list(table.values())[chosen])[:, :most]
         ratios[name] = np.max(np.sqrt(np.mean(np.square(found), axis=2)) / best, axis=0)
-    # The worst errors over the best known, for 1 to 8 Gaussians.
+    # The worst errors over the best known, for 1, 2, ... Gaussians.
     assert np.max(ratios["per channel"]) < BAR, ratios
-    assert max(np.max(ratios["shared"]), np.max(ratios["shared, held"])) < SHARED_BAR, ratios
+    assert max(np.max(ratios[name]) for name in shared) < SHARED_BAR, ratios
 
 
-def test_layers_reach_the_best_known_errors(float64):
+@pytest.mark.long
+@pytest.mark.usefixtures("double")
+@pytest.mark.once
+def test_layers_reach_the_best_known_errors():
     skin = LayeredMultipole(sj.load_profile("skin_layers").layers, fresnel=EganFresnel())
     own = fit_gaussians(skin, 6, spread=VariancesPerChannel())
     np.testing.assert_allclose(own.error, [1.837e-3, 1.199e-3, 8.899e-4], rtol=1e-3)
@@ -211,7 +213,8 @@ def test_float32_reaches_its_floor_and_calls_it_success():
             assert fitted.error.dtype == jnp.float32
             assert bool(fitted.result == optx.RESULTS.successful)
             assert np.all(np.asarray(fitted.error) < IN_FLOAT32 * best + FLOAT32_FLOOR)
-        fitted = fit_gaussians(media("marble"), 4, weights=FixedTotalReflectance())
+        near = GivenVariances([0.04, 0.15, 0.9, 7.0])
+        fitted = fit_gaussians(media("marble"), 4, weights=FixedTotalReflectance(), start=near)
     assert np.max(np.abs(fitted.energy_error)) < HELD_IN_FLOAT32
     assert np.all(np.diff(fitted.gaussians.variances) > 0)
 
@@ -219,10 +222,8 @@ def test_float32_reaches_its_floor_and_calls_it_success():
 def test_the_search_says_when_it_gave_up(float64, monkeypatch):
     profile = media("skin2")
     problem = make_problem(profile, FreeWeights(), L2_QUADRATURE)
-    found, converged = refine(problem, greedy_path(problem, 2)[-1])
-    assert bool(converged)
     monkeypatch.setattr(_search, "_NEWTON_STEPS", 0)
-    start = found + jnp.asarray([0.3, 0.0])
+    start = jnp.asarray([-1.0, 2.0])
     unmoved, converged = refine(problem, start)
     np.testing.assert_array_equal(unmoved, start)
     assert not bool(converged)
@@ -239,7 +240,7 @@ def test_from_tabulated_starts_one_descent_finds_the_best_fits(float64):
 @pytest.mark.once
 @pytest.mark.parametrize(
     ("count_of_media", "counts"),
-    [(3, (2, 5)), pytest.param(16, range(1, 9), marks=pytest.mark.long)],
+    [(2, (2, 3)), pytest.param(16, range(1, 9), marks=pytest.mark.long)],
 )
 def test_many_media_compile_one_program_for_each_count(compiled, count_of_media, counts):
     """Python numbers in a medium are arrays: each medium has the programs of the first."""

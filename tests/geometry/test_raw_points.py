@@ -55,7 +55,7 @@ def plane(count=900, spacing=1.0, seed=0):
     return np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
 
 
-@pytest.mark.parametrize("gap", [1.6, 2.5])
+@pytest.mark.parametrize("gap", [1.6])
 def test_two_sheets_close_together_are_not_mixed(gap):
     """A slab little thicker than its points are apart: each side has its own normals, and they face
     away from each other.
@@ -70,7 +70,7 @@ def test_two_sheets_close_together_are_not_mixed(gap):
     assert (np.sign(normals[inner & ~above, 2]) == -1).all()
 
 
-@pytest.mark.parametrize("angle", [35, 90, 120])
+@pytest.mark.parametrize("angle", [35, 120])
 def test_the_sides_of_an_edge_keep_their_own_normals(angle):
     """Half a spacing away from it a point is one side's."""
     sheet = plane(1600)

@@ -68,23 +68,23 @@ def test_areas_are_those_of_voronoi_cells():
     assert np.abs(error).max() < 0.06  # 600^2 points are 900 a cell: 1 % noise
 
 
-def test_discs_leave_no_hole(splats):
-    """Every point of the surface lies within 0.9 of the radius of some splat."""
-    fine = sample_mesh(sphere(), 20 * COUNT)
-    distance, near = cKDTree(np.asarray(splats.centers)).query(np.asarray(fine.centers), k=4)
-    assert (distance / np.asarray(splats.radii)[near]).min(axis=1).max() < 0.9
-
-
-def test_points_are_spread_as_blue_noise(splats):
-    """Nearest neighbors: 0.5 of the spacing on average when random, 1.07 in a hexagonal grid."""
-    spacing = np.sqrt(sphere().area() / COUNT)
-    nearest = (
-        cKDTree(np.asarray(splats.centers)).query(np.asarray(splats.centers), k=2)[0][:, 1]
-        / spacing
-    )
+def test_splats_are_blue_noise_leave_no_hole_and_lie_in_memory_as_in_space(splats):
+    """Nearest neighbors: 0.5 of the spacing on average when random, 1.07 in a hexagonal grid. Every
+    point of the surface lies within 0.9 of the radius of some splat.
+    """
+    centers, spacing = np.asarray(splats.centers), np.sqrt(sphere().area() / COUNT)
+    tree = cKDTree(centers)
+    nearest = tree.query(centers, k=2)[0][:, 1] / spacing
     assert nearest.mean() > 0.83
     assert nearest.min() > 0.45
     assert nearest.std() < 0.12
+    fine = sample_mesh(sphere(), 6 * COUNT, seed=1)
+    distance, near = tree.query(np.asarray(fine.centers), k=4)
+    assert (distance / np.asarray(splats.radii)[near]).min(axis=1).max() < 0.9
+    step = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    assert np.median(step) < 3 * spacing
+    np.testing.assert_array_equal(sample_mesh(sphere(), COUNT).centers, centers)
+    assert not np.array_equal(sample_mesh(sphere(), COUNT, seed=1).centers, centers)
 
 
 def test_density_is_even_over_large_and_small_triangles():
@@ -100,18 +100,6 @@ def test_density_is_even_over_large_and_small_triangles():
     centers = np.asarray(sample_mesh(both, COUNT).centers)
     share = upper.area() / both.area()
     assert abs((centers[:, 1] > 0).mean() - share) < 0.02
-
-
-def test_same_seed_same_splats_and_another_seed_others(splats):
-    again, other = sample_mesh(sphere(), COUNT), sample_mesh(sphere(), COUNT, seed=1)
-    np.testing.assert_array_equal(np.asarray(again.centers), np.asarray(splats.centers))
-    assert not np.array_equal(np.asarray(other.centers), np.asarray(splats.centers))
-
-
-def test_nearby_splats_are_near_in_memory(splats):
-    centers = np.asarray(splats.centers)
-    step = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    assert np.median(step) < 3 * np.sqrt(sphere().area() / COUNT)
 
 
 def test_cut_keeps_what_is_above_the_plane():
@@ -161,21 +149,13 @@ def test_textures_land_where_their_coordinates_say():
     np.testing.assert_allclose(found[inner], expected[inner], atol=1e-5)
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_normal_map_tilts_along_u_and_v(mirrored):
-    mesh = square()
-    tilt = (
-        np.asarray([0.6, 0.0, 0.8]) * np.ones((2, 2, 1)),
-        np.asarray([0.0, 0.6, 0.8]) * np.ones((2, 2, 1)),
-    )
-    mapped = dataclasses.replace(mesh, uvs=mesh.uvs * [-1 if mirrored else 1, 1])
-    along_u, along_v = (
-        np.asarray(sample_mesh(mapped, 20, textures=Textures(normal=n)).normals) for n in tilt
-    )
-    np.testing.assert_allclose(
-        along_u, np.tile([-0.6 if mirrored else 0.6, 0, 0.8], (20, 1)), atol=1e-6
-    )
-    np.testing.assert_allclose(along_v, np.tile([0, 0.6, 0.8], (20, 1)), atol=1e-6)
+@pytest.mark.parametrize("side", [1, -1])
+def test_normal_map_tilts_along_u_and_v_mirrored_or_not(side):
+    mesh = dataclasses.replace(square(), uvs=square().uvs * [side, 1])
+    for tilt, expected in (([0.6, 0, 0.8], [0.6 * side, 0, 0.8]), ([0, 0.6, 0.8],) * 2):
+        textures = Textures(normal=np.tile(tilt, (2, 2, 1)))
+        normals = sample_mesh(mesh, 20, textures=textures).normals
+        np.testing.assert_allclose(normals, np.tile(expected, (20, 1)), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -190,17 +170,12 @@ def test_what_cannot_be_sampled_is_refused(mesh, count, textures, message):
     assert_refused(lambda: sample_mesh(mesh, count, textures=textures), message)
 
 
-def anywhere(mesh: Mesh, each: int = 20) -> SurfacePoints:
-    shares = np.random.default_rng(0).dirichlet(np.ones(3), each * len(mesh.faces))
-    return SurfacePoints(np.repeat(np.arange(len(mesh.faces)), each), shares)
-
-
 def test_a_rounded_sphere_is_round_to_fourth_order():
     """In the length of its edges; what flat triangles are off by is of second."""
     flat, off = [], []
-    for subdivisions in (2, 3):
-        mesh = sphere(subdivisions=subdivisions)
-        points = anywhere(mesh)
+    for mesh in (sphere(subdivisions=2), sphere(subdivisions=3)):
+        shares = np.random.default_rng(0).dirichlet(np.ones(3), 20 * len(mesh.faces))
+        points = SurfacePoints(np.repeat(np.arange(len(mesh.faces)), 20), shares)
         flat.append(np.max(np.abs(np.linalg.norm(points.positions(mesh), axis=1) - 50)))
         off.append(np.max(np.abs(np.linalg.norm(Rounding(mesh).positions(points), axis=1) - 50)))
     assert off[0] < 0.03 * flat[0]
@@ -252,59 +227,35 @@ def test_creases_split_normals_where_triangles_differ():
 
 def test_rounded_splats_cover_the_rounded_surface():
     splats = sample_mesh(sphere(subdivisions=2), COUNT, rounded=True)
-    centers, normals = (
-        np.asarray(splats.centers, np.float64),
-        np.asarray(splats.normals, np.float64),
-    )
-    from_middle = np.linalg.norm(centers, axis=1)
+    from_middle = np.linalg.norm(splats.centers, axis=1)
     np.testing.assert_allclose(from_middle, 50, rtol=5e-4)
-    assert np.min(np.sum(centers * normals, axis=1) / from_middle) > np.cos(np.radians(0.5))
-    np.testing.assert_allclose(
-        np.asarray(splats.areas, np.float64).sum(), 4 * np.pi * 50**2, rtol=1e-3
-    )
+    cosines = np.sum(np.asarray(splats.centers * splats.normals), axis=1) / from_middle
+    assert np.min(cosines) > np.cos(np.radians(0.5))
+    areas = np.asarray(splats.areas, np.float64)
+    np.testing.assert_allclose(areas.sum(), 4 * np.pi * 50**2, rtol=1e-3)
 
 
-@pytest.fixture(scope="module")
-def mesh():
-    return bust_mesh()
-
-
-@pytest.mark.once  # made and measured in NumPy, whatever JAX's precision
-def test_bust_is_closed_and_faces_outward(mesh):
-    """Every edge belongs to two triangles, which run along it in opposite directions; and Euler's
-    number of one body without a hole.
+def test_the_bust_is_closed_faces_outward_and_is_life_size():
+    """Every edge belongs to two triangles, which run along it in opposite directions; Euler's
+    number is that of one body without a hole; and texture coordinates cover the unit square once.
     """
+    mesh = bust_mesh()
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert body.is_watertight
     assert body.is_winding_consistent
     assert body.volume > 0
     assert body.euler_number == 2
-
-
-@pytest.mark.once  # made and measured in NumPy, whatever JAX's precision
-def test_bust_is_life_size(mesh):
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     np.testing.assert_allclose((high - low)[0], 230, atol=25)
-    np.testing.assert_allclose(
-        low[0], -high[0], atol=0.3
-    )  # the same on both sides, but for the grid
+    np.testing.assert_allclose(low[0], -high[0], atol=0.3)  # alike on both sides, but for the grid
     assert 110 < high[1] < 120
     head = mesh.vertices[mesh.vertices[:, 1] > 30]
     np.testing.assert_allclose(np.ptp(head[:, 0]), 155, atol=8)
     np.testing.assert_allclose(np.ptp(head[:, 2]), 190, atol=12)
-
-
-@pytest.mark.once  # made and measured in NumPy, whatever JAX's precision
-def test_normals_of_the_bust_agree_with_its_triangles(mesh):
-    a, b, c = np.moveaxis(mesh.corners(), 1, 0)
-    face_normals = np.cross(b - a, c - a)
-    agreement = np.einsum("fi,fi->f", face_normals, mesh.normals[mesh.faces].mean(axis=1))
+    normals = mesh.normals[mesh.faces].mean(axis=1)
+    agreement = np.einsum("fi,fi->f", body.triangles_cross, normals)
     areas = mesh.face_areas()
     assert areas[agreement < 0].sum() < 2e-3 * areas.sum()  # in the folds of lids and nostrils
-
-
-@pytest.mark.once  # made and measured in NumPy, whatever JAX's precision
-def test_texture_coordinates_cover_the_unit_square_once(mesh):
     assert mesh.uvs.min() >= 0
     assert mesh.uvs[..., 1].max() <= 1
     across = np.ptp(mesh.uvs[..., 0], axis=1) > 0.5  # those around the poles

@@ -41,11 +41,13 @@ def lobe_at(normal, wi, wo, f0=0.028, specular=0.18, roughness=0.3, dtype=None):
 UP = [[0.0, 0.0, 1.0]]
 
 
+@pytest.mark.once
 def test_fresnel_of_skin_and_of_no_interface(dtype):
     np.testing.assert_allclose(float(fresnel_f0(jnp.asarray(1.4, dtype))), 1 / 36, rtol=1e-6)
     assert float(fresnel_f0(jnp.asarray(1.0, dtype))) == 0
 
 
+@pytest.mark.once
 def test_helmholtz_reciprocity(dtype):
     wi, wo = random_directions(64, 3), random_directions(64, 4)
     there, back = lobe_at(UP, wi, wo, dtype=dtype), lobe_at(UP, wo, wi, dtype=dtype)
@@ -64,6 +66,7 @@ LOBES = {
 }
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("place", LOBES)
 def test_lobe_is_that_of_the_formula_with_fresnel_at_the_half_vector(place, dtype):
     *given, expected = LOBES[place]
@@ -108,9 +111,11 @@ def test_gradients_of_the_lobe(float64):
     wi, wo = jnp.asarray(random_directions(8, 6)), jnp.asarray(random_directions(8, 7))
     normal = jnp.asarray(unit(random_directions(8, 8) + np.asarray([0, 0, 3.0])))
     scalars = (jnp.asarray(0.05), jnp.asarray(0.5), jnp.asarray(0.4))
-    check_grads(jax.jit(lobe_at), (normal, wi, wo, *scalars), order=2, rtol=1e-5)
+    given = normal, wi, wo, *scalars
+    check_grads(jax.jit(lobe_at), given, order=2, modes=["rev"], rtol=1e-5)
 
 
+@pytest.mark.once
 def test_root_of_albedo_and_its_floor(dtype):
     albedo = jnp.asarray([0.0, 1e-5, 1e-4, 0.25, 1.0], dtype)
     np.testing.assert_allclose(
@@ -158,10 +163,9 @@ def arrays(dtype, *values):
     return tuple(jnp.asarray(value, dtype) for value in values)
 
 
-def leaving(mu, f0, roughness):
-    return diffuse_transmission(
-        mu, f0, roughness, sj.scattering.AngularLaw(jnp.ones((1, 1), mu.dtype))
-    )[0]
+def leaving(mu, f0, roughness, law=((1.0,),)):
+    law = sj.scattering.AngularLaw(jnp.asarray(law, mu.dtype))
+    return diffuse_transmission(mu, f0, roughness, law)[0]
 
 
 ALBEDO, LEAVING = jax.jit(directional_albedo), jax.jit(leaving)
@@ -172,6 +176,7 @@ def random_places(count, seed):
     return rng.uniform(0.02, 1, count), rng.uniform(0.1, 1, count)
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("f0", [0.0, 0.028, 1.0])
 def test_table_is_the_integral_of_the_lobe(f0, dtype):
     mu, roughness = random_places(24, seed=1)
@@ -180,6 +185,7 @@ def test_table_is_the_integral_of_the_lobe(f0, dtype):
     np.testing.assert_allclose(np.asarray(table), truth, atol=TABLE_ERROR, rtol=0)
 
 
+@pytest.mark.once
 @pytest.mark.parametrize(
     ("mu", "f0", "scale", "expected"),
     [
@@ -195,6 +201,7 @@ def test_albedos_are_those_published_and_in_closed_form(mu, f0, scale, expected,
     np.testing.assert_allclose(np.asarray(table) * scale, expected, atol=1e-3)
 
 
+@pytest.mark.once
 def test_never_more_than_all_light(dtype):
     mu, roughness = jnp.meshgrid(
         jnp.linspace(0, 1, 101, dtype=dtype), jnp.linspace(0.01, 1.2, 40, dtype=dtype)
@@ -205,6 +212,7 @@ def test_never_more_than_all_light(dtype):
         assert f0 > 0 or np.all(table == 0)
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("roughness", [0.1, 0.3, 0.6, 1.0])
 def test_white_furnace_in_closed_form(roughness, dtype):
     # Under uniform unit radiance a white diffuser below the interface returns, with the lobe,
@@ -242,14 +250,14 @@ def test_slopes_agree_with_the_quadrature(float64):
 @pytest.mark.parametrize(
     ("function", "arguments", "order"),
     [
-        (leaving, ([0.07, 0.4, 0.9], 0.015, 0.3), 1),
-        (leaving, ([0.07, 0.4, 0.9], 0.05, [0.2, 0.5, 0.8]), 1),
+        (leaving, ([0.07, 0.4, 0.9], 0.05, [0.2, 0.5, 0.8], [[0.8], [0.3], [-0.1]]), 1),
         (lambda mu: directional_albedo(mu, *arrays(None, 0.05, 0.3)), (0.4,), 2),
     ],
-    ids=["one roughness", "a map", "twice in the cosine"],
+    ids=["leaving", "twice in the cosine"],
 )
 def test_gradients_in_every_argument(float64, function, arguments, order):
-    check_grads(jax.jit(function), arrays(None, *arguments), order=order, rtol=1e-5, eps=1e-6)
+    given = arrays(None, *arguments)
+    check_grads(jax.jit(function), given, order, modes=["rev"], rtol=1e-5, eps=1e-6)
 
 
 VALUES_AND_SLOPES = [
@@ -272,8 +280,8 @@ PLACE, ORIGIN, AXIS = np.asarray([[8.0, 20.0, 15.0], [1.0, 2.0, 30.0], [0.1, 0.0
 STRENGTHS = np.asarray([[1.0, 2, 3], [0.5, 0.1, 0.2], [900.0, 500, 100], [4.0, 5, 6]])
 
 
-@pytest.mark.parametrize("count", [300, 20_000, 40_000])
-def test_irradiance_is_the_sum_of_the_formulas(count, dtype):
+@pytest.mark.parametrize("count", [20_000, 40_000])
+def test_irradiance_is_the_sum_of_the_formulas(count, float32):
     """Large ones too: jaxlib 0.10.2 gets these sums wrong on CPUs at many counts, in float32."""
     body = bodies.bumpy(count)
     centers, normals = np.asarray(body.centers, float), np.asarray(body.normals, float)
@@ -289,7 +297,7 @@ def test_irradiance_is_the_sum_of_the_formulas(count, dtype):
     rng, visible, shares = np.random.default_rng(0), [], {}
     for group in groups:
         share = rng.uniform(size=(len(group.light_indices), count))
-        visible.append(jnp.asarray(share, dtype) if group.lights.cast_shadows else None)
+        visible.append(jnp.asarray(share, jnp.float32) if group.lights.cast_shadows else None)
         shares |= dict(zip(group.light_indices, share, strict=True))
     found = jax.jit(
         lambda visible: sum_received(
@@ -324,7 +332,8 @@ def test_a_spot_has_its_derivatives(float64):
     def received(place, direction, inner, outer, points):
         return sj.scene.SpotLight(place, direction, STRENGTHS[2], inner, outer).incidence(points)
 
-    check_grads(received, (jnp.asarray(PLACE), -jnp.asarray(PLACE), 3.0, 40.0, points), 2)
+    given = jnp.asarray(PLACE), -jnp.asarray(PLACE), 3.0, 40.0, points
+    check_grads(received, given, order=2, modes=["rev"])
 
 
 EDGES = np.asarray([[3.0, 0, 0], [0, 2.0, 0]])
@@ -339,6 +348,7 @@ LIGHTS = {
 }
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("kind", LIGHTS)
 def test_the_solid_angle_is_the_sum_over_its_area(kind, dtype):
     light, area, places, most = LIGHTS[kind]
@@ -352,9 +362,9 @@ def test_the_solid_angle_is_the_sum_over_its_area(kind, dtype):
 
 
 def test_solid_angles_have_derivatives(float64):
-    for light in (LIGHTS["rectangle"][0], LIGHTS["disk"][0], sj.scene.SphereLight([0] * 3, 1, 1.0)):
-        angles = jax.jit(lambda x, light=light: light.solid_angle(x))
-        check_grads(angles, (jnp.asarray(SEEN_FROM[2:]),), 1, rtol=1e-5)
+    lights = LIGHTS["rectangle"][0], LIGHTS["disk"][0], sj.scene.SphereLight([0] * 3, 1, 1.0)
+    angles = jax.jit(lambda x: [light.solid_angle(x) for light in lights])
+    check_grads(angles, (jnp.asarray(SEEN_FROM[2:]),), order=1, modes=["rev"], rtol=1e-5)
 
 
 @pytest.mark.once
