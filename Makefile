@@ -58,9 +58,11 @@ test-x64: setup
 test-once: setup
 	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(PYTEST) -m "(once or unoptimized) and not long"
 
-# What `make test` has no time for.
+# What `make test` has no time for, in both precisions.
 test-long: setup
 	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(BIN)/python -m pytest -n $(WORKERS) --dist load -m long
+	JAX_ENABLE_X64=1 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" \
+	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -m long
 
 # Ten thousand scenes and losses, in both precisions: no gradient of a finite loss may be infinite or no number.
 random-scenes: setup
