@@ -74,6 +74,7 @@ def drawn(name: str, splats: sj.Splats, rows, *cameras: sj.Camera):
 
 
 @pytest.mark.once
+@pytest.mark.long
 def test_squares_smaller_than_a_pixel_are_gray_and_still_with_a_filter_and_alias_without():
     """From cameras that shift by fractions of a pixel. The mean of the black and white squares is
     gray, 1/2: all contrast is an alias, and so is all power below half of Nyquist.
