@@ -148,11 +148,12 @@ def _insert(
     them.
     """
     last = active_count - 1
+    half = (_FIRST[1] - _FIRST[0]) / (2 * best.shape[0])
+    alone = jnp.linspace(_FIRST[0] + half, _FIRST[1] - half, best.shape[0], dtype=best.dtype)[place]
     place = jnp.minimum(place, last)
     below = jnp.where(place > 0, best[place - 1], best[0] - 2 * _OUTWARD)
     above = jnp.where(place < last, best[place], best[last - 1] + 2 * _OUTWARD)
-    first = jnp.linspace(*_FIRST, best.shape[0], dtype=best.dtype)[place]
-    return best.at[last].set(jnp.where(last == 0, first, 0.5 * (below + above)))
+    return best.at[last].set(jnp.where(last == 0, alone, 0.5 * (below + above)))
 
 
 def _descend(

@@ -23,8 +23,8 @@ pytestmark = pytest.mark.once
 SKIN = [0.4395, 0.2133, 0.1155]  # what leaves skin1, by Monte Carlo (MCML)
 OWN = """[medium]
 unit = "1/mm"
-sigma_a = [0.03, 0.2, 0.5]
-sigma_s_prime = [0.7, 0.9, 1.0]
+sigma_a = [0.0021, 0.0041, 0.0071]
+sigma_s_prime = [2.19, 2.62, 3.0]
 eta = 1.5
 [surface]
 roughness = 0.11
@@ -183,6 +183,7 @@ def test_a_fit_to_its_own_file_keeps_what_stood_there(tmp_path):
     assert after["source"]["citation"] == "measured by hand"
     assert after["source"]["provenance"].startswith("the third sample; fitted by splatjax")
     assert len(after["fit"]["variances"]) == 2
+    assert max(after["fit"]["error"]) < 0.5  # 1 if no Gaussian is as wide as the profile
     with jax.enable_x64(True):
         assert run("fit", path, "--count", 2, "--output", path) == 0
     assert tomllib.loads(path.read_text())["surface"] == after["surface"]
