@@ -11,12 +11,13 @@ LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_em
     --xla_cpu_parallel_codegen_split_count=1
 # Every worker of every run imports the same modules, with their shapes checked: whatever the shell sets, bytecode is kept.
 unexport PYTHONDONTWRITEBYTECODE
-# Compilers allocate and free much: memory that is kept need not be cleared again, and no error here needs the line of Python
-# that each instruction came from. Together a tenth of the time.
-export MALLOC_TRIM_THRESHOLD_ := 4000000000
-export MALLOC_TOP_PAD_ := 67108864
-export MALLOC_MMAP_THRESHOLD_ := 1000000000
-export JAX_TRACEBACK_IN_LOCATIONS_LIMIT := 0
+# Compilers allocate and free much: memory that is kept need not be cleared again, and no error of a test needs the line of
+# Python that each instruction came from. Together a tenth of the time. Demo and benchmarks run as users have it.
+TESTS := test-float32 test-x64 test-once test-long random-scenes coverage
+$(TESTS): export MALLOC_TRIM_THRESHOLD_ := 4000000000
+$(TESTS): export MALLOC_TOP_PAD_ := 67108864
+$(TESTS): export MALLOC_MMAP_THRESHOLD_ := 1000000000
+$(TESTS): export JAX_TRACEBACK_IN_LOCATIONS_LIMIT := 0
 
 .PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz mutants coverage lint bench lock sbom docs \
     always figures notebooks gallery release-check release-check-lowest
