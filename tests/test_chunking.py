@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from bodies import assert_close
 
-from splatjax._chunking import map_chunks, needed_over_planned, zeros_after
+from splatjax._chunking import (
+    list_chosen,
+    map_chunks,
+    needed_over_planned,
+    running,
+    zeros_after,
+)
 
 
 def squares_and_lengths(scale, record):
@@ -71,3 +77,22 @@ def test_one_more_than_planned_is_reported_however_much_was_planned(planned):
     assert float(ratio(jnp.int32(planned))) == 1
     assert float(ratio(jnp.int32(planned + 1))) > 1
     assert float(ratio(jnp.int32(0))) == 0
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 1024, 1000])
+def test_running_sums_and_maxima_are_numpys(count):
+    numbers = np.random.default_rng(count).integers(0, 9, (3, count)).astype(np.int32)
+    for combine, expected in (
+        (jnp.add, np.cumsum(numbers, axis=1)),
+        (jnp.maximum, np.maximum.accumulate(numbers, axis=1)),
+    ):
+        np.testing.assert_array_equal(running(combine, jnp.asarray(numbers)), expected)
+
+
+@pytest.mark.parametrize("capacity", [1, 40, 100])
+def test_the_chosen_are_listed_in_order_up_to_the_capacity(capacity):
+    chosen = np.random.default_rng(2).random(100) < 0.4
+    expected = np.full(capacity, 100)
+    indices = np.flatnonzero(chosen)[:capacity]
+    expected[: len(indices)] = indices
+    np.testing.assert_array_equal(list_chosen(jnp.asarray(chosen), capacity), expected)

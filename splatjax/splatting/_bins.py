@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from splatjax._chunking import needed_over_planned, with_spare
+from splatjax._chunking import needed_over_planned, running, with_spare
 
 from ._grid import TILE_BITS, TileGrid, TileRanges
 
@@ -87,10 +87,11 @@ def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
     the capacity needed over planned.
     """
     counts = ranges.across * ranges.down
-    ends = jnp.cumsum(counts)
+    ends = running(jnp.add, counts)
     begins, total = ends - counts, ends[-1]
-    items = jnp.arange(counts.shape[0], dtype=jnp.int32)
-    item = jnp.repeat(items, counts, total_repeat_length=capacity)
+    # As many items have ended before a pair as lie before its own.
+    ended = jnp.zeros(capacity, jnp.int32).at[ends].add(1, mode="drop")
+    item = jnp.minimum(running(jnp.add, ended), counts.shape[0] - 1)
     pair = jnp.arange(capacity, dtype=jnp.int32)
 
     def of_item(values):
@@ -121,25 +122,19 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
     sorted_tile = (keys >> _ROW_BITS).astype(jnp.int32)
     column_before = (keys & (_ROW - 1)).astype(jnp.int32)
 
-    # Mark the last pair of each tile in its row, and find for every pair where its tile ends.
-    rows = keys.shape[0]
-    ends = jnp.concatenate(
-        [sorted_tile[:, 1:] != sorted_tile[:, :-1], jnp.ones((rows, 1), bool)], axis=1
-    )
+    # Mark the first pair of each tile in its row, and find for every pair where its tile begins.
     column_after = jnp.arange(_ROW, dtype=jnp.int32)[None]
-    candidates = jnp.where(ends, column_after, _ROW)
-    run_end = lax.cummin(candidates, axis=1, reverse=True)
+    begins = jnp.pad(sorted_tile[:, 1:] != sorted_tile[:, :-1], ((0, 0), (1, 0)))
+    from_begin = column_after - running(jnp.maximum, jnp.where(begins, column_after, 0))
 
-    # Carry the counts from row to row. A rank is the count after the row, less the pairs of the
-    # tile from here to the end of the row.
+    # Carry the counts from row to row. A rank is the count before the row, and the pairs of the
+    # tile before it in the row.
     def count_on(counts, row):
-        tiles_of_row, from_end = row
-        counts = counts.at[tiles_of_row].add(1, mode="promise_in_bounds")
-        return counts, counts.at[tiles_of_row].get(mode="promise_in_bounds") - from_end
+        tiles_of_row, from_begin = row
+        rank = counts.at[tiles_of_row].get(mode="promise_in_bounds") + from_begin
+        return counts.at[tiles_of_row].add(1, mode="promise_in_bounds"), rank
 
-    counts, rank = lax.scan(
-        count_on, jnp.zeros(tiles + 1, jnp.int32), (sorted_tile, run_end - column_after + 1)
-    )
+    counts, rank = lax.scan(count_on, jnp.zeros(tiles + 1, jnp.int32), (sorted_tile, from_begin))
     return sorted_tile, column_before, rank, counts[:tiles]
 
 
@@ -155,7 +150,9 @@ def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins
     # Longest lists first; equal ones in scan order, so that the lanes of a chunk are neighbors.
     lengths = -(-counts // slots)
     order = jnp.argsort(-lengths, stable=True).astype(jnp.int32)
-    first_block = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(lengths[order[::lanes]])])
+    first_block = jnp.concatenate(
+        [jnp.zeros(1, jnp.int32), running(jnp.add, lengths[order[::lanes]])]
+    )
 
     # Compute the first slot of each tile, and from it the slot of every pair.
     lane = jnp.arange(tiles, dtype=jnp.int32)

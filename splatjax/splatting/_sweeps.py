@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._chunking import jit_unless_traced, needed_over_planned, zeros_after
+from splatjax._chunking import jit_unless_traced, list_chosen, needed_over_planned, zeros_after
 from splatjax._combination import AbstractCombination
 from splatjax._precision import full_precision
 
@@ -51,7 +51,7 @@ class Spans(eqx.Module):
         """
         order = jnp.argsort(-lengths)
         shown = jnp.any(limits > -jnp.inf, axis=1)
-        tiles = _taken(order.astype(jnp.int32), _listed(shown[order], size), len(order))
+        tiles = _taken(order.astype(jnp.int32), list_chosen(shown[order], size), len(order))
         far_limit = _taken(limits, tiles, jnp.inf)
         far_limit = jnp.where(far_limit > -jnp.inf, far_limit, jnp.inf)
         needed = needed_over_planned(jnp.sum(shown), size).astype(limits.dtype)
@@ -65,7 +65,7 @@ class Spans(eqx.Module):
         """
         is_open &= self.far_limit < jnp.inf
         chosen = jnp.any(is_open, axis=1)
-        listed = _listed(chosen, size)
+        listed = list_chosen(chosen, size)
         near_limit = _taken(self.far_limit, listed, -jnp.inf)
         open_limit = jnp.where(_taken(is_open, listed, False), near_limit, -jnp.inf)
         needed = needed_over_planned(jnp.sum(chosen), size).astype(near_limit.dtype)
@@ -256,11 +256,6 @@ def sum_parts(
         needed = combination.largest([jnp.maximum(spans.needed, lists)])
         results.append((FragmentSums(spans.tiles, sums[k], needed, capacity.front), spans))
     return results
-
-
-def _listed(chosen: Bool[Array, " all"], size: int) -> Int[Array, " size"]:
-    """List the indices of the chosen ones; their number for empty places."""
-    return jnp.nonzero(chosen, size=size, fill_value=len(chosen))[0].astype(jnp.int32)
 
 
 def _taken(array: Array, places: Int[Array, " places"], fill) -> Array:

@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from splatjax._chunking import map_chunks, needed_over_planned, take_points, with_spare
+from splatjax._chunking import (
+    list_chosen,
+    map_chunks,
+    needed_over_planned,
+    take_points,
+    with_spare,
+)
 from splatjax._combination import AbstractCombination, DeviceMesh
 from splatjax._precision import full_precision
 from splatjax.cache import reuse_capacity
@@ -130,12 +136,8 @@ class TilePlan(AbstractRasterPlan):
         self, splats: Splats, view: AbstractView
     ) -> tuple[Int[Array, " chosen"], Float[Array, ""]]:
         may_be_seen = view.may_see(splats)
-        ends = jnp.cumsum(may_be_seen.astype(jnp.int32))
-        every = jnp.arange(splats.count, dtype=jnp.int32)
-        listed = jnp.full(self.splats, splats.count, jnp.int32)
-        listed = listed.at[jnp.where(may_be_seen, ends - 1, self.splats)].set(every, mode="drop")
-        needed = needed_over_planned(ends[-1], self.splats)
-        return listed, needed.astype(splats.centers.dtype)
+        needed = needed_over_planned(jnp.sum(may_be_seen, dtype=jnp.int32), self.splats)
+        return list_chosen(may_be_seen, self.splats), needed.astype(splats.centers.dtype)
 
     def sum_fragments(
         self,
