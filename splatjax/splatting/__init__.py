@@ -6,8 +6,6 @@ from ._bins import (
     bin_items as bin_items,
     BinCapacity as BinCapacity,
     Bins as Bins,
-    scatter_slots as scatter_slots,
-    slot_plane as slot_plane,
 )
 from ._dense import DenseRasterizer as DenseRasterizer
 from ._views import (

@@ -176,19 +176,3 @@ def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins
         needed,
         capacity.chunks * lanes,
     )
-
-
-def slot_plane(
-    plane: Float[Array, " items"], fill: float, bins: Bins
-) -> Float[Array, "blocks lanes slots"]:
-    """Gather a value of each item into its slots; `fill` in empty slots."""
-    return plane.at[bins.ids].get(mode="fill", fill_value=fill)
-
-
-def scatter_slots(
-    slots: Float[Array, "*blocks slots"], bins: Bins, items: int
-) -> Float[Array, " items"]:
-    """Add the slots of every item: the transpose of the gather."""
-    return (
-        jnp.zeros(items, slots.dtype).at[bins.ids.reshape(-1)].add(slots.reshape(-1), mode="drop")
-    )

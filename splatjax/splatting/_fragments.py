@@ -8,9 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Float, Int
 
-from ._bins import Bins, slot_plane
+from ._bins import Bins
 from ._grid import TILE_SIDE, TileGrid
 from ._rasterizer import (
     PixelSums,
@@ -21,8 +21,8 @@ from ._rasterizer import (
 from ._views import AbstractView
 
 # Fields of the footprints on which sums depend.
-PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")
-_EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel center
+NUMBERS = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")
+_EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0, 0.0)  # covers no pixel center
 
 
 class Lanes(eqx.Module):
@@ -30,8 +30,7 @@ class Lanes(eqx.Module):
 
     **Attributes:**
 
-    - `row`: of the lane's first block in `Slots`, whose arrays are `[blocks * lanes, slots]`; block
-      b is at `row + b * stride`.
+    - `row`: of the lane's first block in `Listed.ids`; block b is at `row + b * stride`.
     - `lengths`: of the lane's chunk, in blocks; the blocks after it belong to the next chunk.
     - `blocks`: the largest of the lengths.
     - `x`, `y`: corners, pixels.
@@ -44,13 +43,9 @@ class Lanes(eqx.Module):
     y: Float[Array, "lanes 1"]
     stride: int = eqx.field(static=True)
 
-    def read(self, plane: Shaped[Array, "rows slots"], block) -> Shaped[Array, "lanes slots"]:
-        return plane.at[self.row + block * self.stride].get(mode="promise_in_bounds")
-
-    def add(
-        self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]
-    ) -> Float[Array, "rows slots"]:
-        return plane.at[self.row + block * self.stride].add(part, mode="promise_in_bounds")
+    def read(self, ids: Int[Array, "rows slots"], block) -> Int[Array, "lanes slots"]:
+        """Read the splats of a block."""
+        return ids.at[self.row + block * self.stride].get(mode="promise_in_bounds")
 
     def until_end(
         self, far_limit: Float[Array, "lanes pixels"], block
@@ -102,9 +97,12 @@ class Sweep(eqx.Module):
         )
         return Lanes(row, lengths, jnp.max(lengths), x, y, lanes)
 
-    def splats(self, planes, block, lanes: Lanes):
-        """Read a block's splats, `[lanes, slots]` each, placed relative to their tile's corner."""
-        x, y, *fields = (lanes.read(plane, block) for plane in planes)
+    def splats(self, listed: "Listed", ids: Int[Array, "lanes slots"], lanes: Lanes):
+        """Read the numbers of splats, `[lanes, slots]` each, placed relative to their tile's
+        corner.
+        """
+        rows = listed.numbers.at[ids].get(mode="promise_in_bounds")
+        x, y, *fields = jnp.moveaxis(rows, 2, 0)
         return x - lanes.x, y - lanes.y, *fields
 
     def fragments(self, splats):
@@ -114,13 +112,14 @@ class Sweep(eqx.Module):
         dx, dy = px - x, py - y
         return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy
 
-    def limits(self, slots: "Slots", lanes: Lanes):
+    def limits(self, listed: "Listed", lanes: Lanes):
         """Find per pixel the nearest shifted fragment: the far limit of the front."""
 
         # These lanes are one chunk: their lists have equal length, so none ends early.
         def nearest(block, limit):
-            nearness, quadric = self.fragments(self.splats(slots.planes, block, lanes))
-            shifted = self.view_class.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
+            splats = self.splats(listed, lanes.read(listed.ids, block), lanes)
+            nearness, quadric = self.fragments(splats)
+            shifted = self.view_class.shifted(nearness, splats[-1][:, :, None])
             return jnp.maximum(
                 limit,
                 jnp.max(
@@ -130,18 +129,18 @@ class Sweep(eqx.Module):
 
         return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._no_limit(lanes))
 
-    def limits_behind(self, slots: "Slots", lanes: Lanes, open_limit):
+    def limits_behind(self, listed: "Listed", lanes: Lanes, open_limit):
         """Find the same behind the front, whose far limit is `open_limit` in open pixels and -inf
         in others: for the fragments of sufficient weight, and for all.
         """
 
         def nearest(block, limits):
-            splats = self.splats(slots.planes, block, lanes)
+            splats = self.splats(listed, lanes.read(listed.ids, block), lanes)
             nearness, quadric = self.fragments(splats)
-            shifted = self.view_class.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
+            shifted = self.view_class.shifted(nearness, splats[-1][:, :, None])
             far_limit = lanes.until_end(jnp.full_like(open_limit, -jnp.inf), block)
             squared_radius = self.squared_radii(nearness, quadric, far_limit, open_limit)
-            weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
+            weight = splats[-2][:, :, None] * fast_fragment_weight(squared_radius)
             least = least_weight(self.view_class, *splats[4:8], self.filter_radius)
             chosen = weight > least[:, :, None], squared_radius < 1
             new = (jnp.max(jnp.where(is_chosen, shifted, -jnp.inf), axis=1) for is_chosen in chosen)
@@ -162,30 +161,31 @@ class Sweep(eqx.Module):
         chosen = self.view_class.inside(nearness, quadric) & between
         return jnp.where(chosen, self.view_class.squared_radius(nearness, quadric), 1.0)
 
-    def rows(self, slots: "Slots", ids, splats):
+    def rows(self, listed: "Listed", ids, splats):
         """Return `[lanes, slots, rows]`: attributes, the plane of nearness over the tile (three
         rows) and 1.
         """
-        x, y, sx, sy, _, _, _, e, _ = splats
+        x, y, sx, sy, _, _, _, e, _, _ = splats
         nearness = jnp.stack([e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=2)
-        attributes = slots.attributes.at[ids].get(mode="fill", fill_value=0)
+        attributes = listed.attributes.at[ids].get(mode="fill", fill_value=0)
         return jnp.concatenate([attributes, nearness], axis=2)
 
-    def sums(self, slots: "Slots", lanes: Lanes, far_limit, near_limit) -> PixelSums:
+    def sums(self, listed: "Listed", lanes: Lanes, far_limit, near_limit) -> PixelSums:
         """Sum over the fragments between two limits."""
 
         def add(block, sums):
-            splats = self.splats(slots.planes, block, lanes)
+            ids = lanes.read(listed.ids, block)
+            splats = self.splats(listed, ids, lanes)
             squared_radius = self.squared_radii(
                 *self.fragments(splats), lanes.until_end(far_limit, block), near_limit
             )
-            weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
-            rows = self.rows(slots, lanes.read(slots.ids, block), splats)
+            weight = splats[-2][:, :, None] * fast_fragment_weight(squared_radius)
+            rows = self.rows(listed, ids, splats)
             # The transpose in memory costs less than it saves in the product.
             rows = lax.optimization_barrier(jnp.swapaxes(rows, 1, 2))
             return sums + jnp.einsum("trs,tsp->trp", rows, weight)
 
-        (places, pixels), rows = far_limit.shape, slots.attributes.shape[1]
+        (places, pixels), rows = far_limit.shape, listed.attributes.shape[1]
         start = jnp.zeros((places, rows + 4, pixels), far_limit.dtype)
         sums = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
         attributes, nearness = sums[:, :rows], sums[:, rows:]
@@ -195,34 +195,34 @@ class Sweep(eqx.Module):
 
     def add_cotangents(
         self,
-        slots: "Slots",
+        listed: "Listed",
         lanes: Lanes,
         far_limit,
         near_limit,
         cotangent: PixelSums,
-        gradients,
-    ):
-        """Add the cotangents of planes, per slot, and of attributes, per splat, for the fragments
-        between two limits, from those of the sums.
+        gradients: Float[Array, "splats_and_one numbers_and_attributes"],
+    ) -> Float[Array, "splats_and_one numbers_and_attributes"]:
+        """Add the cotangents of splats for the fragments between two limits, from those of the
+        sums.
         """
         px, py = self.pixels(far_limit.dtype)
         monomials = jnp.asarray(
             np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
         )
-        count, of_nearness = slots.attributes.shape[1], cotangent.rows[:, -1:]
+        count, of_nearness = listed.attributes.shape[1], cotangent.rows[:, -1:]
         of_plane = [of_nearness * px[None, None], of_nearness * py[None, None]]
         of_weights = cotangent.weights[:, None]
         of_rows = jnp.concatenate([cotangent.rows, *of_plane, of_weights], axis=1)
 
         def add(block, gradients):
-            splats = self.splats(slots.planes, block, lanes)
+            ids = lanes.read(listed.ids, block)
+            splats = self.splats(listed, ids, lanes)
             nearness, quadric = self.fragments(splats)
             squared_radius = self.squared_radii(
                 nearness, quadric, lanes.until_end(far_limit, block), near_limit
             )
             weight = fast_fragment_weight(squared_radius)
-            ids, opacity = lanes.read(slots.ids, block), splats[-1]
-            rows = self.rows(slots, ids, splats)
+            opacity, rows = splats[-2], self.rows(listed, ids, splats)
             # Cotangents of the summed rows, per slot, for a weight without opacity.
             d_rows = jnp.einsum("tsp,trp->tsr", weight, of_rows)
             d_opacity = jnp.sum(rows * d_rows, axis=2)
@@ -238,54 +238,44 @@ class Sweep(eqx.Module):
             near = jnp.moveaxis(d_nearness @ monomials[:, :3], 2, 0)
             d_rows = d_rows * opacity[:, :, None]
             near = near + jnp.moveaxis(d_rows[:, :, count : count + 3], 2, 0)
-            of_planes, of_attributes = gradients
-            d_planes = *_plane_cotangents(splats, quad, near), d_opacity
-            return (
-                tuple(
-                    lanes.add(total, block, new)
-                    for total, new in zip(of_planes, d_planes, strict=True)
-                ),
-                of_attributes.at[ids].add(d_rows[:, :, :count], mode="drop"),
-            )
+            d_numbers = jnp.stack([*_number_cotangents(splats, quad, near), d_opacity], axis=2)
+            d_splats = jnp.concatenate([d_numbers, d_rows[:, :, :count]], axis=2)
+            return gradients.at[ids].add(d_splats, mode="promise_in_bounds")
 
         return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)
 
 
-class Slots(eqx.Module):
-    """The input of the sweeps: planes gathered into slots, in rows of one lane each, and attributes
-    per splat, which are too many for slots.
+class Listed(eqx.Module):
+    """The input of the sweeps: lists of splats, and the splats.
+
+    **Attributes:**
+
+    - `ids`: the slots, in rows of one lane each.
+    - `numbers`: `NUMBERS` and shift of every splat, and of the one that empty slots refer to.
+    - `attributes`: of every splat.
     """
 
     ids: Int[Array, "rows slots"]
-    planes: list[Float[Array, "rows slots"]]
-    shift: Float[Array, "rows slots"]
+    numbers: Float[Array, "splats_and_one numbers"]
     attributes: Float[Array, "splats attributes"]
 
     @classmethod
-    def gathered(
+    def of(
         cls,
         shift: Float[Array, " splats"],
-        planes: tuple[Float[Array, " splats"], ...],
+        numbers: tuple[Float[Array, " splats"], ...],
         attributes: Float[Array, "splats attributes"],
         bins: Bins,
-    ) -> "Slots":
-        """Gather splats into the slots of the bins."""
-        width = bins.ids.shape[2]
-
-        def slots(plane, fill):
-            return slot_plane(plane, fill, bins).reshape(-1, width)
-
-        return cls(
-            ids=bins.ids.reshape(-1, width),
-            planes=[slots(plane, fill) for plane, fill in zip(planes, _EMPTY, strict=True)],
-            shift=slots(shift, 0.0),
-            attributes=attributes,
-        )
+    ) -> "Listed":
+        rows = jnp.stack([*numbers, shift], axis=1)
+        empty = jnp.asarray([_EMPTY], rows.dtype)
+        ids = bins.ids.reshape(-1, bins.ids.shape[2])
+        return cls(ids, jnp.concatenate([rows, empty]), attributes)
 
 
-def _plane_cotangents(splats, quad, near):
+def _number_cotangents(splats, quad, near):
     """Convert moments of the cotangents over the pixels to cotangents of a splat's numbers."""
-    x, y, sx, sy, a, b, c, _, _ = splats
+    x, y, sx, sy, a, b, c, _, _, _ = splats
     m, mx, my, mxx, mxy, myy = quad
     n, nx, ny = near
     dx, dy = mx - x * m, my - y * m

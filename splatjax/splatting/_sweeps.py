@@ -19,8 +19,8 @@ from splatjax._chunking import jit_unless_traced, list_chosen, needed_over_plann
 from splatjax._combination import AbstractCombination
 from splatjax._precision import full_precision
 
-from ._bins import Bins, scatter_slots
-from ._fragments import Lanes, Slots, Sweep, second_limits
+from ._bins import Bins
+from ._fragments import NUMBERS, Lanes, Listed, Sweep, second_limits
 from ._grid import TILE_SIDE
 from ._rasterizer import FragmentSums, PixelSums, SurfaceCapacity
 from ._views import OPEN
@@ -88,34 +88,34 @@ def sum_tile_fragments(
     combination: AbstractCombination,
     bins: Bins,
     shift: Float[Array, " splats"],
-    planes: tuple[Float[Array, " splats"], ...],
+    numbers: tuple[Float[Array, " splats"], ...],
     attributes: Float[Array, "splats attributes"],
 ) -> FragmentSums:
     """Sum attributes over the splats of every tile: this device's part of the sums."""
-    return _sum_fwd(sweep, capacity, combination, bins, shift, planes, attributes)[0]
+    return _sum_fwd(sweep, capacity, combination, bins, shift, numbers, attributes)[0]
 
 
-def _sum_fwd(sweep, capacity, combination, bins, shift, planes, attributes):
-    part = PartSweep(sweep, bins, Slots.gathered(shift, planes, attributes, bins))
+def _sum_fwd(sweep, capacity, combination, bins, shift, numbers, attributes):
+    part = PartSweep(sweep, bins, Listed.of(shift, numbers, attributes, bins))
     ((sums, spans),) = sum_parts(lambda: [[part]], [capacity], combination)
-    return sums, (bins, shift, planes, attributes, spans)
+    return sums, (part, spans)
 
 
 @full_precision
 def _sum_bwd(sweep: Sweep, capacity: SurfaceCapacity, combination, residuals, cotangent):
-    bins, shift, planes, attributes, spans = residuals
-    part = PartSweep(sweep, bins, Slots.gathered(shift, planes, attributes, bins))
-    dtype, cotangent = shift.dtype, cotangent.sums
+    (part, spans), cotangent = residuals, cotangent.sums
+    listed = part.listed
 
     def add(_, *arguments):
-        return sweep.add_cotangents(part.slots, *arguments)
+        return sweep.add_cotangents(listed, *arguments)
 
-    of_planes = tuple(zeros_after(cotangent, part.slots.shift.shape, dtype) for _ in planes)
-    gradients = of_planes, zeros_after(cotangent, attributes.shape, dtype)
+    fields, attributes = len(NUMBERS), listed.attributes.shape[1]
+    shape = len(listed.numbers), fields + attributes
+    gradients = zeros_after(cotangent, shape, listed.numbers.dtype)
     rows = spans.far_limit, spans.near_limit, cotangent
-    of_planes, of_rows = part.each_round(spans.tiles, rows, add, gradients)
-    of_splats = (scatter_slots(slots, bins, shift.shape[0]) for slots in of_planes)
-    return None, None, tuple(of_splats), of_rows
+    gradients = part.each_round(spans.tiles, rows, add, gradients)[:-1]
+    of_numbers = tuple(jnp.moveaxis(gradients[:, :fields], 1, 0))
+    return None, None, of_numbers, gradients[:, fields:]
 
 
 sum_tile_fragments.defvjp(_sum_fwd, _sum_bwd)
@@ -128,26 +128,26 @@ class PartSweep(eqx.Module):
 
     sweep: Sweep
     bins: Bins
-    slots: Slots
+    listed: Listed
 
     @jit_unless_traced
     def limits(self) -> tuple[Float[Array, "tiles pixels"], Int[Array, " tiles"]]:
         """Compute the end of the front, -inf without one; and the length of each list."""
-        grid, order, dtype = self.sweep.grid, self.bins.order, self.slots.shift.dtype
+        grid, order, dtype = self.sweep.grid, self.bins.order, self.listed.numbers.dtype
 
         def chunk(i, limits):
             lane_numbers = i * grid.lanes + jnp.arange(grid.lanes, dtype=jnp.int32)
-            new = self.sweep.limits(self.slots, self.sweep.lanes(self.bins, lane_numbers, dtype))
+            new = self.sweep.limits(self.listed, self.sweep.lanes(self.bins, lane_numbers, dtype))
             return limits.at[order[lane_numbers]].set(new, mode="drop")
 
-        limits = zeros_after(self.slots.shift, (grid.count, TILE_SIDE**2), dtype) - jnp.inf
+        limits = zeros_after(self.listed.numbers, (grid.count, TILE_SIDE**2), dtype) - jnp.inf
         limits = jax.lax.fori_loop(jnp.int32(0), self.bins.chunks, chunk, limits)
         lengths = jnp.repeat(jnp.diff(self.bins.first_block), grid.lanes)
         return limits, jnp.zeros(grid.count, jnp.int32).at[order].set(lengths, mode="drop")
 
     def empty_sums(self, front: Spans, capacity: SurfaceCapacity) -> PixelSums:
         """Return sums over no fragments, for the places of both surfaces."""
-        places, attributes = capacity.front + capacity.behind, self.slots.attributes
+        places, attributes = capacity.front + capacity.behind, self.listed.attributes
         inputs, dtype = (front.far_limit, attributes), front.far_limit.dtype
         rows = zeros_after(inputs, (places, attributes.shape[1] + 1, TILE_SIDE**2), dtype)
         return PixelSums(rows, zeros_after(inputs, (places, TILE_SIDE**2), dtype))
@@ -158,7 +158,7 @@ class PartSweep(eqx.Module):
 
         def add(i, lanes: Lanes, far_limit, near_limit, tiles, so_far):
             sums = self.sweep.within_picture(
-                self.sweep.sums(self.slots, lanes, far_limit, near_limit), tiles
+                self.sweep.sums(self.listed, lanes, far_limit, near_limit), tiles
             )
             before = _sliced(so_far, first + i, len(tiles))
             return _write(so_far, jax.tree.map(jnp.add, before, sums), first + i)
@@ -175,7 +175,7 @@ class PartSweep(eqx.Module):
         """
 
         def look(i, lanes: Lanes, open_limit, limits):
-            return _write(limits, self.sweep.limits_behind(self.slots, lanes, open_limit), i)
+            return _write(limits, self.sweep.limits_behind(self.listed, lanes, open_limit), i)
 
         none = zeros_after(open_limit, open_limit.shape, open_limit.dtype) - jnp.inf
         return self.each_round(tiles, (open_limit,), look, (none, none))
@@ -184,7 +184,7 @@ class PartSweep(eqx.Module):
         """Apply `function(first place, lanes, *rows, out)` to the places, as many at a time as
         there are lanes, up to the last tile.
         """
-        grid, bins, dtype = self.sweep.grid, self.bins, self.slots.shift.dtype
+        grid, bins, dtype = self.sweep.grid, self.bins, self.listed.numbers.dtype
         planned = bins.planned_lanes
         # The lane of every tile, and of every place; `planned` where the list is empty.
         of_tile = jnp.full(grid.padded_count + 1, planned, jnp.int32)

@@ -23,7 +23,7 @@ from splatjax.cache import reuse_capacity
 from splatjax.scene import Splats
 
 from ._bins import BinCapacity, bin_items
-from ._fragments import PLANES, Slots, Sweep
+from ._fragments import NUMBERS, Listed, Sweep
 from ._grid import TileGrid
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, SurfaceCapacity
 from ._sweeps import PartSweep, sum_tile_fragments
@@ -165,11 +165,11 @@ class TilePlan(AbstractRasterPlan):
         chosen, _ = self.choose(splats, view)
         seen = splats.take(chosen), take_points(attributes, chosen)
         sweep, bins, *binned = self._bin(*seen, view, settings)
-        return PartSweep(sweep, bins, Slots.gathered(*binned, bins))
+        return PartSweep(sweep, bins, Listed.of(*binned, bins))
 
     def _bin(self, splats: Splats, attributes, view: AbstractView, settings: SplattingSettings):
         """Project the splats, and list them by tile. Returns the input of a sweep: its settings,
-        the lists, and the shifts, planes and attributes of the splats.
+        the lists, and the shifts, numbers and attributes of the splats.
         """
         grid = self.rasterizer.grid(view)
         footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
@@ -177,7 +177,7 @@ class TilePlan(AbstractRasterPlan):
             Sweep(type(view), grid, settings.filter_radius),
             bin_items(footprints.ranges(grid), grid, self.bins),
             jax.lax.stop_gradient(footprints.shift),
-            tuple(getattr(footprints, name) for name in PLANES),
+            tuple(getattr(footprints, name) for name in NUMBERS),
             attributes.T,
         )
 
