@@ -7,8 +7,10 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from splatjax._chunking import needed_over_planned, running, with_spare
 from splatjax.scene import Splats
 from splatjax.splatting import (
     AbstractRasterizer,
@@ -44,7 +46,10 @@ class AbstractListRasterizer(AbstractRasterizer):
             )
         counts = [_demand(self.kernel, parts[0], view, settings) for view in views]
         grid = TileGrid(views[0].width, views[0].height)
-        return ListPlan(self, BinCapacity.for_counts(counts, grid))
+        # Blocks of the longest list of each chunk: the lists of a chunk take as many each.
+        longest = [np.sort(grid.blocks(tiles))[::-1][:: grid.lanes] for tiles in counts]
+        blocks = with_spare(("blocks", grid), max(int(chunks.sum()) for chunks in longest), 4)
+        return ListPlan(self, BinCapacity.for_counts(counts, grid), blocks)
 
     def for_shadows(self) -> AbstractRasterizer:
         return TileRasterizer()
@@ -65,6 +70,7 @@ class ListPlan(AbstractRasterPlan):
 
     rasterizer: AbstractListRasterizer
     capacity: BinCapacity
+    blocks: int = eqx.field(static=True)
 
     def sum_fragments(
         self,
@@ -77,25 +83,29 @@ class ListPlan(AbstractRasterPlan):
         grid = TileGrid(view.width, view.height)
         footprints = self.rasterizer.kernel.footprints(splats, view, settings)
         bins = bin_items(footprints.ranges(grid), grid, self.capacity)
-        block = jnp.arange(bins.ids.shape[0], dtype=jnp.int32)
-        chunk = jnp.searchsorted(bins.first_block, block, side="right") - 1
-        lists = Lists(footprints, bins, chunk.astype(jnp.int32), grid)
+        lengths = grid.blocks(bins.counts[bins.order[:: grid.lanes]])
+        ends = jnp.concatenate([running(jnp.add, lengths), jnp.full(1, self.blocks, jnp.int32)])
+        block = jnp.arange(self.blocks, dtype=jnp.int32)
+        chunk = jnp.searchsorted(ends, block, side="right").astype(jnp.int32)
+        lists = Lists(footprints, bins, chunk, ends[chunk] - 1 - block, grid)
         rows = self.rasterizer.front(lists, attributes, view)
         rows = jnp.where(grid.within_picture(bins.order)[:, None], rows, 0.0)
         tiles = jnp.minimum(bins.order, grid.count)
         sums = PixelSums(rows[:, :-1], rows[:, -1])
-        return FragmentSums(tiles, sums, bins.needed.astype(rows.dtype), len(rows))
+        needed = jnp.maximum(bins.needed, needed_over_planned(ends[-2], self.blocks))
+        return FragmentSums(tiles, sums, needed.astype(rows.dtype), len(rows))
 
 
 class Lists(eqx.Module):
     """The splats of every tile, in blocks of `[lanes, slots]`; the blocks of a chunk hold the lists
-    of the same tiles.
+    of the same tiles, and are numbered.
     """
 
     footprints: Footprints
     bins: Bins
     chunk: Int[Array, " blocks"]
     """The number of chunks for a block that holds nothing."""
+    number: Int[Array, " blocks"]
     grid: TileGrid
 
     def map_blocks(self, look: Callable[..., Result], *more) -> Result:
@@ -112,9 +122,10 @@ class Lists(eqx.Module):
         last = self.bins.order.shape[0] // grid.lanes - 1
 
         @jax.checkpoint
-        def map_block(ids, chunk):
+        def map_block(chunk, number):
             chunk = jnp.minimum(chunk, last)
             tile = jax.lax.dynamic_slice_in_dim(self.bins.order, chunk * grid.lanes, grid.lanes)
+            ids = self.bins.block(tile, number, grid.slots)
             x, y = (pixel.astype(dtype)[:, None] + 0.5 for pixel in grid.columns_and_rows(tile))
             footprints = jax.tree.map(
                 lambda plane: plane.at[ids].get(mode="fill", fill_value=0)[:, :, None],
@@ -128,7 +139,7 @@ class Lists(eqx.Module):
                 *(values[chunk] for values in more),
             )
 
-        return jax.lax.map(lambda block: map_block(*block), (self.bins.ids, self.chunk))
+        return jax.lax.map(lambda block: map_block(*block), (self.chunk, self.number))
 
     def reduce_blocks(self, combine: Callable, results: jax.Array) -> jax.Array:
         """Combine what the blocks of each chunk found, by a segment reduction: `[chunks, lanes,

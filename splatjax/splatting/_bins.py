@@ -1,8 +1,8 @@
-"""Lists of items per tile of the picture, stored so that sweeps over them read contiguous memory.
+"""Lists of items per tile of the picture.
 
-Tiles are ordered by the length of their list and swept `lanes` at a time, a *chunk*; the lists of a
-chunk are stored as *blocks* of `[lanes, slots]`. No item is dropped: the only limits are the
-planned numbers of pairs and of blocks, and exceeding either is reported.
+Tiles are swept `lanes` at a time, those with lists of similar length together, and `slots` items of
+each list at a time, a *block*. No item is dropped: the only limits are the planned numbers of pairs
+and of tiles with any item, and exceeding either is reported.
 """
 
 from collections.abc import Sequence
@@ -22,10 +22,9 @@ _ROW = 1 << _ROW_BITS  # pairs sorted together
 
 
 class BinCapacity(eqx.Module):
-    """Capacity of the lists: pairs of item and tile, blocks, and chunks with any item. Static."""
+    """Capacity of the lists: pairs of item and tile, and chunks with any item. Static."""
 
     pairs: int = eqx.field(static=True)
-    blocks: int = eqx.field(static=True)
     chunks: int = eqx.field(static=True)
 
     @classmethod
@@ -33,25 +32,18 @@ class BinCapacity(eqx.Module):
         cls, per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid, spare: float = 1.03
     ) -> "BinCapacity":
         """Choose the capacity for each of these numbers of items per tile."""
-        pairs, blocks, chunks, all_chunks = 1, 1, 1, grid.padded_count // grid.lanes
-        for tiles in per_tile:
-            counts = np.asarray(tiles, np.int64)
-            # Blocks of the longest list of each chunk: the lists of a chunk take as many each.
-            longest = np.sort(-(-counts // grid.slots))[::-1][:: grid.lanes]
-            pairs, blocks = max(pairs, int(counts.sum())), max(blocks, int(longest.sum()))
-            chunks = max(chunks, int((longest > 0).sum()))
+        counts = [np.asarray(tiles, np.int64) for tiles in per_tile]
+        pairs = max(int(tiles.sum()) for tiles in counts)
+        chunks = max(-(-int((tiles > 0).sum()) // grid.lanes) for tiles in counts)
         chunks = with_spare(("chunks", grid), chunks, -(-grid.half // 4), spare=spare)
         return cls(
-            with_spare(("pairs", grid), pairs, _ROW, per_octave=4, spare=spare),
-            with_spare(("blocks", grid), blocks, 4, per_octave=2, spare=spare),
-            min(max(chunks, grid.half), all_chunks),
+            with_spare(("pairs", grid), max(pairs, 1), _ROW, per_octave=4, spare=spare),
+            min(max(chunks, grid.half), grid.padded_count // grid.lanes),
         )
 
     def coarse(self, grid: TileGrid) -> "BinCapacity":
-        """Round up to the next powers of two, and to all chunks."""
-        all_chunks = grid.padded_count // grid.lanes
-        pairs, blocks = (1 << count.bit_length() for count in (self.pairs, self.blocks))
-        return BinCapacity(pairs, blocks, all_chunks)
+        """Round up to the next power of two, and to all chunks."""
+        return BinCapacity(1 << self.pairs.bit_length(), grid.padded_count // grid.lanes)
 
 
 class Bins(eqx.Module):
@@ -59,27 +51,31 @@ class Bins(eqx.Module):
 
     **Attributes:**
 
-    - `ids`: of items; an empty slot contains the number of items.
-    - `order`: the tile of each lane, chunk after chunk.
-    - `first_block`: of each chunk; the last entry is the number of all blocks.
+    - `ids`: of items, in one list per tile.
+    - `begins`, `counts`: of the list of every tile, and of an empty one after the last tile.
+    - `order`: the tiles, those with the longest lists first; a *chunk* is `lanes` of them.
     - `needed`: capacity needed over planned; above 1 the lists are incomplete.
-    - `planned_lanes`: capacity of the leading chunks, in lanes; the lists beyond are empty. Static.
+    - `items`: their number. Static.
     """
 
-    ids: Int[Array, "blocks lanes slots"]
+    ids: Int[Array, " pairs"]
+    begins: Int[Array, " tiles_and_one"]
+    counts: Int[Array, " tiles_and_one"]
     order: Int[Array, " tiles"]
-    first_block: Int[Array, " chunks_and_one"]
     needed: Float[Array, ""]
-    planned_lanes: int = eqx.field(static=True)
+    items: int = eqx.field(static=True)
 
-    @property
-    def chunks(self) -> Int[Array, ""]:
-        """Count the chunks that are not empty, which come first: lists are sorted by length."""
-        return jnp.minimum(_occupied(self.first_block), self.planned_lanes // self.ids.shape[1])
-
-
-def _occupied(first_block: Int[Array, " chunks_and_one"]) -> Int[Array, ""]:
-    return jnp.sum(first_block[1:] > first_block[:-1], dtype=jnp.int32)
+    def block(
+        self, tiles: Int[Array, " lanes"], number: Int[Array, ""], slots: int
+    ) -> Int[Array, "lanes slots"]:
+        """Read one block of each of these tiles' lists: `slots` ids; the number of items in the
+        slots after the end of a list.
+        """
+        place = (number * slots + jnp.arange(slots, dtype=jnp.int32))[None]
+        listed = jnp.where(
+            place < self.counts[tiles][:, None], self.begins[tiles][:, None] + place, len(self.ids)
+        )
+        return self.ids.at[listed].get(mode="fill", fill_value=self.items)
 
 
 def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
@@ -112,7 +108,8 @@ def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
 def _ranks(tile: Int[Array, " pairs"], tiles: int):
     """Compute the rank of each pair in its tile's list, in rows that are sorted by tile.
 
-    Returns, for the sorted pairs, tile, column before sorting and rank; and the counts per tile.
+    Returns, for the sorted pairs, tile, column before sorting and rank; and the counts per tile,
+    that of empty pairs last.
     """
     # Sort each row by tile; the low bits keep the order within a tile.
     column = jnp.arange(_ROW, dtype=jnp.uint32)[None]
@@ -135,44 +132,27 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
         return counts.at[tiles_of_row].add(1, mode="promise_in_bounds"), rank
 
     counts, rank = lax.scan(count_on, jnp.zeros(tiles + 1, jnp.int32), (sorted_tile, from_begin))
-    return sorted_tile, column_before, rank, counts[:tiles]
+    return sorted_tile, column_before, rank, counts
 
 
 def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins:
     """List the items of every tile, in order. Not differentiated."""
-    items, lanes, slots, tiles = ranges.left.shape[0], grid.lanes, grid.slots, grid.padded_count
-    size = capacity.blocks * lanes * slots
+    items, tiles = ranges.left.shape[0], grid.padded_count
     # List the pairs item after item, and number the pairs of each tile.
-    item, tile, pairs = _pairs(ranges, grid, capacity.pairs)
+    item, tile, needed = _pairs(ranges, grid, capacity.pairs)
     tile, column, rank, counts = _ranks(tile, tiles)
     item = jnp.take_along_axis(item.reshape(-1, _ROW), column, axis=1, mode="promise_in_bounds")
 
-    # Longest lists first; equal ones in scan order, so that the lanes of a chunk are neighbors.
-    lengths = -(-counts // slots)
-    order = jnp.argsort(-lengths, stable=True).astype(jnp.int32)
-    first_block = jnp.concatenate(
-        [jnp.zeros(1, jnp.int32), running(jnp.add, lengths[order[::lanes]])]
-    )
+    # Tile after tile. Empty pairs, whose tile is the one after the last, come after all others.
+    begins = running(jnp.add, counts) - counts
+    place = begins.at[tile].get(mode="promise_in_bounds") + rank
+    ids = jnp.full(capacity.pairs, items, jnp.int32)
+    ids = ids.at[place.reshape(-1)].set(item.reshape(-1), mode="drop")
 
-    # Compute the first slot of each tile, and from it the slot of every pair.
-    lane = jnp.arange(tiles, dtype=jnp.int32)
-    begins = first_block[lane // lanes] * (lanes * slots) + (lane % lanes) * slots
-    begin_of_tile = jnp.full(tiles + 1, size, jnp.int32).at[order].set(begins)
-    target = (
-        begin_of_tile.at[tile].get(mode="promise_in_bounds")
-        + (rank // slots) * (lanes * slots)
-        + rank % slots
-    )
-    ids = jnp.full(size, items, jnp.int32).at[target.reshape(-1)].set(item.reshape(-1), mode="drop")
-
-    # Compute the needed over the planned capacity.
-    blocks = needed_over_planned(first_block[-1], capacity.blocks)
-    chunks = needed_over_planned(_occupied(first_block), capacity.chunks)
-    needed = jnp.maximum(pairs, jnp.maximum(blocks, chunks))
-    return Bins(
-        ids.reshape(capacity.blocks, lanes, slots),
-        order,
-        first_block,
-        needed,
-        capacity.chunks * lanes,
-    )
+    # Longest lists first; of equally many blocks in scan order, so that the lanes of a chunk are
+    # neighbors.
+    counts = counts.at[tiles].set(0)
+    blocks = grid.blocks(counts[:tiles])
+    order = jnp.argsort(-blocks, stable=True).astype(jnp.int32)
+    occupied = needed_over_planned(jnp.sum(blocks > 0), capacity.chunks * grid.lanes)
+    return Bins(ids, begins, counts, order, jnp.max(jnp.stack([needed, occupied])), items)

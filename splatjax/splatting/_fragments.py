@@ -10,6 +10,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from splatjax._chunking import divided
+
 from ._bins import Bins
 from ._grid import TILE_SIDE, TileGrid
 from ._rasterizer import (
@@ -26,32 +28,19 @@ _EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0, 0.0)  # covers no pixel
 
 
 class Lanes(eqx.Module):
-    """Tiles that are swept together: the starts of their lists in the slots, and their corners.
+    """Tiles that are swept together.
 
     **Attributes:**
 
-    - `row`: of the lane's first block in `Listed.ids`; block b is at `row + b * stride`.
-    - `lengths`: of the lane's chunk, in blocks; the blocks after it belong to the next chunk.
-    - `blocks`: the largest of the lengths.
+    - `tiles`: the number of tiles for an empty lane.
+    - `blocks`: of the longest of their lists.
     - `x`, `y`: corners, pixels.
     """
 
-    row: Int[Array, " lanes"]
-    lengths: Int[Array, " lanes"]
+    tiles: Int[Array, " lanes"]
     blocks: Int[Array, ""]
     x: Float[Array, "lanes 1"]
     y: Float[Array, "lanes 1"]
-    stride: int = eqx.field(static=True)
-
-    def read(self, ids: Int[Array, "rows slots"], block) -> Int[Array, "lanes slots"]:
-        """Read the splats of a block."""
-        return ids.at[self.row + block * self.stride].get(mode="promise_in_bounds")
-
-    def until_end(
-        self, far_limit: Float[Array, "lanes pixels"], block
-    ) -> Float[Array, "lanes pixels"]:
-        """Exclude all fragments of the lanes whose list has ended before a block."""
-        return jnp.where((block < self.lengths)[:, None], far_limit, jnp.inf)
 
 
 class Sweep(eqx.Module):
@@ -81,21 +70,15 @@ class Sweep(eqx.Module):
         side = np.arange(TILE_SIDE, dtype=dtype) + np.asarray(0.5, dtype)
         return np.tile(side, TILE_SIDE), np.repeat(side, TILE_SIDE)
 
-    def lanes(self, bins: Bins, lane_numbers: Int[Array, " lanes"], dtype) -> Lanes:
-        """Look up lanes by their number in `bins.order`; those from `bins.planned_lanes` on are
-        empty and have length 0.
-        """
-        lanes, across = self.grid.lanes, self.grid.across
-        exist = lane_numbers < bins.planned_lanes
-        lane_numbers = jnp.minimum(lane_numbers, bins.planned_lanes - 1)
-        tiles, chunk = bins.order[lane_numbers], lane_numbers // lanes
-        row = bins.first_block[chunk] * lanes + lane_numbers % lanes
-        lengths = jnp.where(exist, bins.first_block[chunk + 1] - bins.first_block[chunk], 0)
-        x, y = (
-            (index * TILE_SIDE).astype(dtype)[:, None]
-            for index in (tiles % across, tiles // across)
-        )
-        return Lanes(row, lengths, jnp.max(lengths), x, y, lanes)
+    def lanes(self, bins: Bins, tiles: Int[Array, " lanes"], dtype) -> Lanes:
+        """Look up some tiles."""
+        blocks = self.grid.blocks(jnp.max(bins.counts[tiles]))
+        down, across = divided(tiles, self.grid.across)
+        x, y = ((index * TILE_SIDE).astype(dtype)[:, None] for index in (across, down))
+        return Lanes(tiles, blocks, x, y)
+
+    def ids(self, listed: "Listed", lanes: Lanes, block) -> Int[Array, "lanes slots"]:
+        return listed.bins.block(lanes.tiles, block, self.grid.slots)
 
     def splats(self, listed: "Listed", ids: Int[Array, "lanes slots"], lanes: Lanes):
         """Read the numbers of splats, `[lanes, slots]` each, placed relative to their tile's
@@ -115,9 +98,8 @@ class Sweep(eqx.Module):
     def limits(self, listed: "Listed", lanes: Lanes):
         """Find per pixel the nearest shifted fragment: the far limit of the front."""
 
-        # These lanes are one chunk: their lists have equal length, so none ends early.
         def nearest(block, limit):
-            splats = self.splats(listed, lanes.read(listed.ids, block), lanes)
+            splats = self.splats(listed, self.ids(listed, lanes, block), lanes)
             nearness, quadric = self.fragments(splats)
             shifted = self.view_class.shifted(nearness, splats[-1][:, :, None])
             return jnp.maximum(
@@ -135,11 +117,11 @@ class Sweep(eqx.Module):
         """
 
         def nearest(block, limits):
-            splats = self.splats(listed, lanes.read(listed.ids, block), lanes)
+            splats = self.splats(listed, self.ids(listed, lanes, block), lanes)
             nearness, quadric = self.fragments(splats)
             shifted = self.view_class.shifted(nearness, splats[-1][:, :, None])
-            far_limit = lanes.until_end(jnp.full_like(open_limit, -jnp.inf), block)
-            squared_radius = self.squared_radii(nearness, quadric, far_limit, open_limit)
+            no_limit = jnp.full_like(open_limit, -jnp.inf)
+            squared_radius = self.squared_radii(nearness, quadric, no_limit, open_limit)
             weight = splats[-2][:, :, None] * fast_fragment_weight(squared_radius)
             least = least_weight(self.view_class, *splats[4:8], self.filter_radius)
             chosen = weight > least[:, :, None], squared_radius < 1
@@ -151,7 +133,7 @@ class Sweep(eqx.Module):
         )
 
     def _no_limit(self, lanes: Lanes):
-        return jnp.full((lanes.row.shape[0], TILE_SIDE**2), -jnp.inf, lanes.x.dtype)
+        return jnp.full((lanes.tiles.shape[0], TILE_SIDE**2), -jnp.inf, lanes.x.dtype)
 
     def squared_radii(self, nearness, quadric, far_limit, near_limit):
         """Compute `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0,
@@ -174,11 +156,9 @@ class Sweep(eqx.Module):
         """Sum over the fragments between two limits."""
 
         def add(block, sums):
-            ids = lanes.read(listed.ids, block)
+            ids = self.ids(listed, lanes, block)
             splats = self.splats(listed, ids, lanes)
-            squared_radius = self.squared_radii(
-                *self.fragments(splats), lanes.until_end(far_limit, block), near_limit
-            )
+            squared_radius = self.squared_radii(*self.fragments(splats), far_limit, near_limit)
             weight = splats[-2][:, :, None] * fast_fragment_weight(squared_radius)
             rows = self.rows(listed, ids, splats)
             # The transpose in memory costs less than it saves in the product.
@@ -215,12 +195,10 @@ class Sweep(eqx.Module):
         of_rows = jnp.concatenate([cotangent.rows, *of_plane, of_weights], axis=1)
 
         def add(block, gradients):
-            ids = lanes.read(listed.ids, block)
+            ids = self.ids(listed, lanes, block)
             splats = self.splats(listed, ids, lanes)
             nearness, quadric = self.fragments(splats)
-            squared_radius = self.squared_radii(
-                nearness, quadric, lanes.until_end(far_limit, block), near_limit
-            )
+            squared_radius = self.squared_radii(nearness, quadric, far_limit, near_limit)
             weight = fast_fragment_weight(squared_radius)
             opacity, rows = splats[-2], self.rows(listed, ids, splats)
             # Cotangents of the summed rows, per slot, for a weight without opacity.
@@ -250,12 +228,11 @@ class Listed(eqx.Module):
 
     **Attributes:**
 
-    - `ids`: the slots, in rows of one lane each.
     - `numbers`: `NUMBERS` and shift of every splat, and of the one that empty slots refer to.
     - `attributes`: of every splat.
     """
 
-    ids: Int[Array, "rows slots"]
+    bins: Bins
     numbers: Float[Array, "splats_and_one numbers"]
     attributes: Float[Array, "splats attributes"]
 
@@ -269,8 +246,7 @@ class Listed(eqx.Module):
     ) -> "Listed":
         rows = jnp.stack([*numbers, shift], axis=1)
         empty = jnp.asarray([_EMPTY], rows.dtype)
-        ids = bins.ids.reshape(-1, bins.ids.shape[2])
-        return cls(ids, jnp.concatenate([rows, empty]), attributes)
+        return cls(bins, jnp.concatenate([rows, empty]), attributes)
 
 
 def _number_cotangents(splats, quad, near):

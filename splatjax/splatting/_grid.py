@@ -4,6 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from splatjax._chunking import divided
+
 TILE_SIDE = 8  # pixels
 _HALF = 128
 TILE_BITS = 22  # in a sort key of 32, for the number of a tile
@@ -49,6 +51,10 @@ class TileGrid(eqx.Module):
         """
         return min(-(-self.padded_count // (2 * self.lanes)), _HALF)
 
+    def blocks(self, counts: Int[Array, "*tiles"]) -> Int[Array, "*tiles"]:
+        """Count the blocks of lists of so many items."""
+        return divided(counts + (self.slots - 1), self.slots)[0]
+
     def cut(self, picture: Float[Array, "rows height width"]) -> Float[Array, "tiles rows pixels"]:
         """Divide a picture into tiles; 0 beyond its edges."""
         rows, height, width = picture.shape
@@ -76,18 +82,14 @@ class TileGrid(eqx.Module):
         self, tiles: Int[Array, " some"]
     ) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
         """Return the column and the row of every pixel of some tiles."""
-        within = jnp.arange(TILE_SIDE**2, dtype=jnp.int32)
-        x = (tiles % self.across * TILE_SIDE)[:, None] + (within % TILE_SIDE)[None]
-        y = (tiles // self.across * TILE_SIDE)[:, None] + (within // TILE_SIDE)[None]
-        return x, y
+        down, across = divided(tiles, self.across)
+        y, x = divided(jnp.arange(TILE_SIDE**2, dtype=jnp.int32), TILE_SIDE)
+        return (across * TILE_SIDE)[:, None] + x[None], (down * TILE_SIDE)[:, None] + y[None]
 
     def pixel(self, x: Int[Array, "..."], y: Int[Array, "..."]) -> Int[Array, "..."]:
         """Return the number of a pixel among those of all tiles, tile by tile."""
-        return (
-            (y // TILE_SIDE * self.across + x // TILE_SIDE) * TILE_SIDE**2
-            + y % TILE_SIDE * TILE_SIDE
-            + x % TILE_SIDE
-        )
+        (across, x), (down, y) = divided(x, TILE_SIDE), divided(y, TILE_SIDE)
+        return (down * self.across + across) * TILE_SIDE**2 + y * TILE_SIDE + x
 
     def within_picture(self, tiles: Int[Array, " some"]) -> Bool[Array, "some pixels"]:
         """Mark the pixels of some tiles that are inside the picture."""

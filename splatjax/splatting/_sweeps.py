@@ -15,7 +15,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._chunking import jit_unless_traced, list_chosen, needed_over_planned, zeros_after
+from splatjax._chunking import (
+    divided,
+    jit_unless_traced,
+    list_chosen,
+    needed_over_planned,
+    zeros_after,
+)
 from splatjax._combination import AbstractCombination
 from splatjax._precision import full_precision
 
@@ -96,7 +102,7 @@ def sum_tile_fragments(
 
 
 def _sum_fwd(sweep, capacity, combination, bins, shift, numbers, attributes):
-    part = PartSweep(sweep, bins, Listed.of(shift, numbers, attributes, bins))
+    part = PartSweep(sweep, Listed.of(shift, numbers, attributes, bins))
     ((sums, spans),) = sum_parts(lambda: [[part]], [capacity], combination)
     return sums, (part, spans)
 
@@ -127,23 +133,20 @@ class PartSweep(eqx.Module):
     """
 
     sweep: Sweep
-    bins: Bins
     listed: Listed
 
     @jit_unless_traced
     def limits(self) -> tuple[Float[Array, "tiles pixels"], Int[Array, " tiles"]]:
-        """Compute the end of the front, -inf without one; and the length of each list."""
-        grid, order, dtype = self.sweep.grid, self.bins.order, self.listed.numbers.dtype
+        """Compute the end of the front, -inf without one; and the blocks of each list."""
+        grid, bins, dtype = self.sweep.grid, self.listed.bins, self.listed.numbers.dtype
 
-        def chunk(i, limits):
-            lane_numbers = i * grid.lanes + jnp.arange(grid.lanes, dtype=jnp.int32)
-            new = self.sweep.limits(self.listed, self.sweep.lanes(self.bins, lane_numbers, dtype))
-            return limits.at[order[lane_numbers]].set(new, mode="drop")
+        def look(_, lanes: Lanes, limits):
+            new = self.sweep.limits(self.listed, lanes)
+            return limits.at[lanes.tiles].set(new, mode="drop")
 
         limits = zeros_after(self.listed.numbers, (grid.count, TILE_SIDE**2), dtype) - jnp.inf
-        limits = jax.lax.fori_loop(jnp.int32(0), self.bins.chunks, chunk, limits)
-        lengths = jnp.repeat(jnp.diff(self.bins.first_block), grid.lanes)
-        return limits, jnp.zeros(grid.count, jnp.int32).at[order].set(lengths, mode="drop")
+        listed = jnp.where(bins.counts[bins.order] > 0, bins.order, grid.count)
+        return self.each_round(listed, (), look, limits), grid.blocks(bins.counts[: grid.count])
 
     def empty_sums(self, front: Spans, capacity: SurfaceCapacity) -> PixelSums:
         """Return sums over no fragments, for the places of both surfaces."""
@@ -184,21 +187,16 @@ class PartSweep(eqx.Module):
         """Apply `function(first place, lanes, *rows, out)` to the places, as many at a time as
         there are lanes, up to the last tile.
         """
-        grid, bins, dtype = self.sweep.grid, self.bins, self.listed.numbers.dtype
-        planned = bins.planned_lanes
-        # The lane of every tile, and of every place; `planned` where the list is empty.
-        of_tile = jnp.full(grid.padded_count + 1, planned, jnp.int32)
-        of_tile = of_tile.at[bins.order[:planned]].set(jnp.arange(planned, dtype=jnp.int32))
-        of_place = of_tile[jnp.where(tiles < grid.count, tiles, grid.padded_count)]
+        grid, bins, dtype = self.sweep.grid, self.listed.bins, self.listed.numbers.dtype
 
         def step(i, out):
             first = i * grid.lanes
-            lane_numbers, *arguments = _sliced((of_place, *rows), first, grid.lanes)
-            return function(first, self.sweep.lanes(bins, lane_numbers, dtype), *arguments, out)
+            chunk, *arguments = _sliced((tiles, *rows), first, grid.lanes)
+            return function(first, self.sweep.lanes(bins, chunk, dtype), *arguments, out)
 
         ends = jnp.arange(1, len(tiles) + 1, dtype=jnp.int32)
         last = jnp.max(jnp.where(tiles < grid.count, ends, 0), initial=0)
-        rounds = -(-last // grid.lanes)
+        rounds, _ = divided(last + (grid.lanes - 1), grid.lanes)
         return jax.lax.fori_loop(jnp.zeros_like(rounds), rounds, step, out)
 
 
@@ -252,7 +250,7 @@ def sum_parts(
         spans = fronts[k].followed_by(behind[k])
         # Only of the first part: a device has one, or it streams parts for which the capacity of
         # the lists was planned.
-        lists = first[k].bins.needed.astype(spans.needed.dtype)
+        lists = first[k].listed.bins.needed.astype(spans.needed.dtype)
         needed = combination.largest([jnp.maximum(spans.needed, lists)])
         results.append((FragmentSums(spans.tiles, sums[k], needed, capacity.front), spans))
     return results

@@ -165,7 +165,7 @@ class TilePlan(AbstractRasterPlan):
         chosen, _ = self.choose(splats, view)
         seen = splats.take(chosen), take_points(attributes, chosen)
         sweep, bins, *binned = self._bin(*seen, view, settings)
-        return PartSweep(sweep, bins, Listed.of(*binned, bins))
+        return PartSweep(sweep, Listed.of(*binned, bins))
 
     def _bin(self, splats: Splats, attributes, view: AbstractView, settings: SplattingSettings):
         """Project the splats, and list them by tile. Returns the input of a sweep: its settings,

@@ -246,8 +246,7 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             tiles = TileGrid(*size, rasterizer.lanes).padded_count
             chunks = -(-tiles // rasterizer.lanes)
             pairs = max(1024, -(-shape.splats * tiles // 1024) * 1024)
-            blocks = chunks * max(-(-shape.splats // rasterizer.slots), 1)
-            bins, places = BinCapacity(pairs, blocks, chunks), SurfaceCapacity(tiles, tiles)
+            bins, places = BinCapacity(pairs, chunks), SurfaceCapacity(tiles, tiles)
             return TilePlan(rasterizer, max(shape.splats, 1), bins, places)
         if isinstance(part, sj.diffusion.ClusterPlan):
             return dataclasses.replace(
