@@ -97,6 +97,8 @@ def take_points(
     """Take points, in ascending order, of arrays that lie along their last axis; 0 for indices from
     the number of points on.
     """
+    if rows.shape[-1] == 0:
+        return jnp.zeros((*rows.shape[:-1], len(chosen)), rows.dtype)
     taken = jnp.moveaxis(rows, -1, 0).at[chosen].get(
         mode="fill", fill_value=0, indices_are_sorted=True, wrap_negative_indices=False
     )
