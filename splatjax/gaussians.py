@@ -4,7 +4,9 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
@@ -110,3 +112,17 @@ class SumOfGaussians(AbstractProfile):
     def white(self) -> "SumOfGaussians":
         """Divide the weights of each channel by their sum."""
         return SumOfGaussians(self.variances, self.weights / jnp.sum(self.weights, axis=0)[None])
+
+
+def pad_gaussians(gaussians: SumOfGaussians) -> SumOfGaussians:
+    """Add Gaussians without weight, too narrow to be resolved, beyond three up to a multiple of
+    three. Not for traced arrays; nothing is compiled.
+    """
+    count = len(gaussians.variances)
+    lacking = -count % 3 if count > 3 else 0
+    if not lacking:
+        return gaussians
+    variances = np.pad(gaussians.variances, (0, lacking))
+    variances[count:] = 1e-6 * variances[:count].min()
+    weights = np.pad(gaussians.weights, ((0, lacking), (0, 0)))
+    return SumOfGaussians(jax.device_put(variances), jax.device_put(weights))

@@ -15,12 +15,13 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from splatjax._combination import AbstractCombination, DeviceMesh, lay_out
+from splatjax.gaussians import pad_gaussians
 from splatjax.scene import AbstractLightSample, Frame, Scene, lights_by_kind
 
 from ._checks import in_one_dtype
 from ._lighting import Transfer
 from ._passes import Passes, SplatLight
-from ._plan import Plan, arrange, pad_gaussians, pad_splats, splats_per_device
+from ._plan import Plan, arrange, pad_splats, splats_per_device
 from ._settings import RenderSettings
 
 Result = TypeVar("Result", bound=PyTree)

@@ -16,7 +16,7 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import Result, rounded_up
 from splatjax._combination import DeviceMesh
 from splatjax.cache import kept, reuse_capacity
-from splatjax.gaussians import SumOfGaussians
+from splatjax.gaussians import pad_gaussians
 from splatjax.scene import (
     AbstractLight,
     AbstractLightSample,
@@ -250,20 +250,6 @@ def pad_splats(splats: Splats, count: int) -> Splats:
     if splats.count == count:
         return splats
     return splats.take(jnp.arange(count, dtype=jnp.int32))
-
-
-def pad_gaussians(gaussians: SumOfGaussians) -> SumOfGaussians:
-    """Add Gaussians without weight, too narrow to be resolved, beyond three up to a multiple of
-    three. Not for traced arrays; nothing is compiled.
-    """
-    count = len(gaussians.variances)
-    lacking = -count % 3 if count > 3 else 0
-    if not lacking:
-        return gaussians
-    variances = np.pad(gaussians.variances, (0, lacking))
-    variances[count:] = 1e-6 * variances[:count].min()
-    weights = np.pad(gaussians.weights, ((0, lacking), (0, 0)))
-    return SumOfGaussians(jax.device_put(variances), jax.device_put(weights))
 
 
 def arrange(
