@@ -99,8 +99,10 @@ def take_points(
     """
     if rows.shape[-1] == 0:
         return jnp.zeros((*rows.shape[:-1], len(chosen)), rows.dtype)
-    taken = jnp.moveaxis(rows, -1, 0).at[chosen].get(
-        mode="fill", fill_value=0, indices_are_sorted=True, wrap_negative_indices=False
+    taken = (
+        jnp.moveaxis(rows, -1, 0)
+        .at[chosen]
+        .get(mode="fill", fill_value=0, indices_are_sorted=True, wrap_negative_indices=False)
     )
     return jnp.moveaxis(taken, 0, -1)
 
