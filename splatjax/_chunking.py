@@ -97,14 +97,16 @@ def take_points(
     """Take points, in ascending order, of arrays that lie along their last axis; 0 for indices from
     the number of points on.
     """
-    if rows.shape[-1] == 0:
+    if rows.size == 0:
         return jnp.zeros((*rows.shape[:-1], len(chosen)), rows.dtype)
-    taken = (
-        jnp.moveaxis(rows, -1, 0)
-        .at[chosen]
-        .get(mode="fill", fill_value=0, indices_are_sorted=True, wrap_negative_indices=False)
-    )
-    return jnp.moveaxis(taken, 0, -1)
+    # Row by row, so that derivatives are planes too, put together once: that of slices is a sum.
+    count = rows.shape[-1]
+    planes = jax.lax.split(rows.reshape(-1, count), [1] * (rows.size // count))
+    taken = [
+        plane[0].at[chosen].get(mode="fill", fill_value=0, indices_are_sorted=True)
+        for plane in planes
+    ]
+    return jnp.stack(taken).reshape(*rows.shape[:-1], len(chosen))
 
 
 def running(
