@@ -91,22 +91,28 @@ def _vectors(tree: PyTree) -> PyTree:
     )
 
 
+def take_rows(
+    array: Shaped[Array, "points ..."], chosen: Int[Array, " chosen"]
+) -> Shaped[Array, "chosen ..."]:
+    """Take points, in ascending order, along the first axis; 0 for indices from the number of
+    points on.
+    """
+    if len(array) == 0:
+        return jnp.zeros((len(chosen), *array.shape[1:]), array.dtype)
+    return array.at[chosen].get(mode="fill", fill_value=0, indices_are_sorted=True)
+
+
 def take_points(
     rows: Shaped[Array, "*rows points"], chosen: Int[Array, " chosen"]
 ) -> Shaped[Array, "*rows chosen"]:
-    """Take points, in ascending order, of arrays that lie along their last axis; 0 for indices from
-    the number of points on.
-    """
+    """Take points likewise, along the last axis."""
     if rows.size == 0:
         return jnp.zeros((*rows.shape[:-1], len(chosen)), rows.dtype)
     # Row by row, so that derivatives are planes too, put together once: that of slices is a sum.
     count = rows.shape[-1]
     planes = jax.lax.split(rows.reshape(-1, count), [1] * (rows.size // count))
-    taken = [
-        plane[0].at[chosen].get(mode="fill", fill_value=0, indices_are_sorted=True)
-        for plane in planes
-    ]
-    return jnp.stack(taken).reshape(*rows.shape[:-1], len(chosen))
+    taken = jnp.stack([take_rows(plane[0], chosen) for plane in planes])
+    return taken.reshape(*rows.shape[:-1], len(chosen))
 
 
 def running(

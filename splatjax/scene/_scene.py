@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from splatjax._chunking import take_rows
 from splatjax._display import png_of, to_display
 from splatjax._records import Numbers, as_floats, check_values, numbers, record, several, valid
 
@@ -180,10 +181,7 @@ class Splats(eqx.Module):
         """Return the splats of these ascending indices. Indices beyond the number of splats give
         invisible splats without light.
         """
-        return jax.tree.map(
-            lambda leaf: leaf.at[chosen].get(mode="fill", fill_value=0, indices_are_sorted=True),
-            self,
-        )
+        return jax.tree.map(lambda leaf: take_rows(leaf, chosen), self)
 
 
 Parts: TypeAlias = Callable[[], Iterable[Splats]]
