@@ -26,6 +26,7 @@ from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jaxlib
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
@@ -142,7 +143,9 @@ def kept_jit(function: Function) -> Function:
         leaves = jax.tree.leaves(eqx.filter(arguments, eqx.is_array))
         if path not in _programs:
             with suppress(Exception):  # whatever is wrong with a file, it is made again
-                content, returned = _read(path)
+                content, returned, calls_lapack = _read(path)
+                if calls_lapack:  # which JAX finds when it lowers the first call of it, not before
+                    jax.jit(jnp.linalg.cholesky).lower(jnp.eye(1))
                 structures = jax.tree.structure(((leaves,), {})), jax.tree.structure(returned)
                 devices = list(leaves[0].devices())
                 program = deserialize_and_load(content, *structures, devices[0].client, devices)
@@ -171,7 +174,8 @@ def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
         program = jax.jit(of_leaves).lower(leaves).compile()
     with suppress(Exception):  # not every program can be serialized
         content, _, returned = serialize(program)
-        _write(path, (content, jax.tree.unflatten(returned, range(returned.num_leaves))))
+        returned = jax.tree.unflatten(returned, range(returned.num_leaves))
+        _write(path, (content, returned, "lapack" in (program.as_text() or "")))
     return program
 
 

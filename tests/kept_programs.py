@@ -26,10 +26,16 @@ def total(tree):
     return {"sum": sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(tree))}
 
 
+@kept_jit
+def solved(matrix):
+    made.append("solved")
+    return jnp.linalg.solve(matrix, jnp.ones(len(matrix)))
+
+
 if __name__ == "__main__":
     keep(sys.argv[1])
     killed = sys.argv[2:] == ["killed"]
     if killed:
         os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
     values = squares(jnp.arange(1001.0 if killed else 1000.0))  # a file that is surely missing
-    print(total(values)["sum"], *made)
+    print(total(values)["sum"] + solved(2 * jnp.eye(2))[0], *made)

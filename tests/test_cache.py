@@ -181,6 +181,6 @@ def test_concurrent_and_killed_processes_leave_whole_files_alone(tmp_path):
     statuses, printed, _ = run_together((words, {}), ([*words, "killed"], {}), (words, {}))
     assert statuses == [0, -signal.SIGKILL, 0]
     names = [path.name.partition("-")[0] for path in tmp_path.glob("shared/*/kept/*-*")]
-    assert sorted(names) == ["squares", "total"]
+    assert sorted(names) == ["solved", "squares", "total"]
     _, (after,), _ = run_together((words, {}))
     assert after.split() == printed[0].split()[:1] == printed[2].split()[:1]

@@ -90,8 +90,9 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
             approach = jnp.maximum(-jnp.tensordot(mirrored, normal, 1), _GRAZING)
             along = jnp.tensordot(from_center, normal, 1) / approach
         hit = from_center + jnp.maximum(along, 0)[..., None] * mirrored
-        axes = self.axes()
-        closest = jnp.tensordot(self.nearest(jnp.tensordot(hit, jnp.linalg.pinv(axes), 1)), axes, 1)
+        axes = self.axes()  # perpendicular
+        per_axis = axes / jnp.sum(axes * axes, axis=1, keepdims=True)
+        closest = jnp.tensordot(self.nearest(jnp.tensordot(hit, per_axis.T, 1)), axes, 1)
         to_nearest = closest - from_center
         squared = jnp.sum(to_nearest * to_nearest, axis=-1, keepdims=True)
         wi = to_nearest / jnp.sqrt(jnp.maximum(squared, 1e-12))
