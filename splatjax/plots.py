@@ -104,8 +104,8 @@ def plot_fit(
     if not rule.reaches_origin:
         nodes, weights = (np.asarray(values) for values in rule.radii(profile))
         begin = float(nodes[weights > 0].min())
-        for axes in (log, residual):
-            axes.axvspan(ends[0], begin, color="0.93", zorder=0)
+        for axes in (linear, log, residual):
+            axes.axvspan(axes.get_xlim()[0], begin, color="0.93", zorder=0)
         residual.text(
             begin,
             0.03,

@@ -179,7 +179,7 @@ class Fit:
         coefficients, target = self._target()
         fitted = self._fitted(target)
         print_fit(fitted, target)
-        self._note_spread(target, fitted)
+        self._note_error(target, fitted)
         total = fitted.gaussians.total_reflectance()
         if float(total.max()) > 1 + 1e-3:
             note(
@@ -196,15 +196,20 @@ class Fit:
             figure = plot_fit(target.profile, fitted.gaussians, rule=target.rule, title=title)
             save_figure(figure, self.plot)
 
-    def _note_spread(self, target: Reference, fitted: sj.fitting.FitResult) -> None:
-        """Note channels whose widths differ too much for shared variances."""
+    def _note_error(self, target: Reference, fitted: sj.fitting.FitResult) -> None:
+        """Note a large error, and its cause if the widths of channels differ too much."""
         scales, count = target.profile.length_scale(), len(fitted.gaussians.variances)
         error, ratio = float(fitted.error.max()), float(scales.max() / scales.min())
-        if error > _LARGE and ratio > _APART:
+        reason = (
+            f"the widths of its channels differ by a factor of {ratio:.2g}, too far apart to share "
+            f"{count} variances"
+            if ratio > _APART
+            else f"{counted(count, 'Gaussian')} cannot follow its profile"
+        )
+        if error > _LARGE:
             note(
-                f"{self.medium}: the widths of its channels differ by a factor of {ratio:.2g}, too "
-                f"far apart to share {count} variances (error {error:.2g}); give a larger --count, "
-                f"or --error {_LARGE}"
+                f"{self.medium}: {reason} (error {error:.2g}); give a larger --count, or --error "
+                f"{_LARGE}"
             )
 
     def _target(self) -> tuple[Coefficients | None, Reference]:

@@ -77,12 +77,11 @@ class Materials:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a material for other renderers: its Gaussians as JSON, or its coefficients as an
-    OpenPBR surface in MaterialX.
+    """Write a material for other renderers, as JSON or MaterialX.
 
-    Each entry of the JSON has its formula, unit and source: GPU Gems weights, a kernel for
-    separable subsurface scattering, Burley's d, the shape parameter of Unity's HDRP, Blender's
-    radius.
+    JSON has its Gaussians, with formula, unit and source of each entry: GPU Gems weights, a kernel
+    for separable subsurface scattering, Burley's d, the shape parameter of Unity's HDRP, Blender's
+    radius. MaterialX has its coefficients, as an OpenPBR surface.
 
     Example: splatjax export marble --output marble.mtlx --mm-per-unit 10
     """

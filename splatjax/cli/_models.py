@@ -205,10 +205,12 @@ _DISTANCES = 7
 
 def print_fit(fitted: sj.fitting.FitResult, target: Reference) -> None:
     """Print the Gaussians of a fit, their errors, and the relative error by distance."""
+    nodes, weights = (np.asarray(values) for values in target.rule.radii(target.profile))
+    begin = "" if target.rule.reaches_origin else f", fitted from {nodes[weights > 0].min():.2g} mm"
     print_table(
         [
             *fitted.table(),
-            ("at r, mm", "fit over profile, less 1"),
+            ("at r, mm", f"fit over profile, less 1{begin}"),
             *_errors_by_distance(target.profile, fitted.gaussians, target.rule),
         ]
     )

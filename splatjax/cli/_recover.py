@@ -139,6 +139,10 @@ class Recover:
             "splatjax": sj.__version__,
         }
         starts = self._starts(search, dependencies, observations[0].picture.shape[2])
+        note(
+            f"not searched: the index of refraction, {float(starts[0].eta[0]):g} (--eta), and the "
+            f"specular lobe, of strength {self.specular:g} (--specular)"
+        )
         begin = time.perf_counter()
 
         def report(message: str, medium: sj.Medium) -> None:

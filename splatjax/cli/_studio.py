@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 import splatjax as sj
-from splatjax.studio import Page, Session
+from splatjax.studio import Page, Session, check_viser
 
 from ._terminal import OptionalPath, check_folder
 from ._view import ENVIRONMENTS, ViewOptions
@@ -43,6 +43,7 @@ class Studio(ViewOptions):
     def run(self) -> None:
         self.check({"port": (1 <= self.port <= 65_535, "lie between 1 and 65535")})
         check_folder(self.output)
+        check_viser()
         splats, material = self.load()
         middle = (splats.centers.min(axis=0) + splats.centers.max(axis=0)) / 2
         observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)

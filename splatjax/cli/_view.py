@@ -85,6 +85,12 @@ class ViewOptions:
         """
         finite, positive = "be a finite number", "be 1 or more"
         azimuth, elevation, fill = self.single_light
+        for name in ("light_azimuth", "light_elevation", "fill"):
+            if self.environment is not None and getattr(self, name) is not None:
+                raise ValueError(
+                    f"{option_name(name)} is for a single light, and --environment replaces it; "
+                    "leave one of the two out"
+                )
         rules: Rules = {
             "fill": (0 <= fill < math.inf, "be 0 or more"),
             "scale": (0 < self.scale < math.inf, "be a positive factor"),
@@ -149,6 +155,7 @@ class ViewOptions:
         material = sj.load_material(self.material)
         if splats.albedo is not None:
             material = material.white()
+        if splats.albedo is not None and self.scattering:
             note(
                 f"the color is the albedo of the splats, and {self.material} only spreads the "
                 "light; --no-albedo gives the color of the material"

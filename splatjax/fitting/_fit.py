@@ -161,7 +161,7 @@ class FitResult(eqx.Module):
             *((f"{float(variance):.6g}", format_numbers(row, ".5f")) for variance, row in pairs),
             ("sum", format_numbers(total, ".5f")),
             ("error (Eq. 4)", format_numbers(self.error, ".2e")),
-            ("energy error", format_numbers(self.energy_error, ".2e")),
+            ("energy error", format_numbers(jnp.round(self.energy_error, 6) + 0.0, ".2e")),
         ]
 
     def _repr_html_(self) -> str:

@@ -33,6 +33,12 @@ def existing_file(path: StrPath) -> Path:
     return path
 
 
+def check_suffix(path: StrPath, suffix: str) -> None:
+    """Raise `ValueError` for a file to write whose name is that of another kind."""
+    if Path(path).suffix.lower() != suffix:
+        raise ValueError(f"{path}: the name of this file must end in {suffix}")
+
+
 @contextmanager
 def naming(where: StrPath) -> Generator[None, None, None]:
     """Add the file, or the place in it, to errors about its contents."""

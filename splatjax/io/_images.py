@@ -18,7 +18,7 @@ from splatjax._memory import check_memory
 from splatjax.scene import Camera, Frame
 
 from ._cameras import camera_matrices
-from ._files import StrPath, atomic_path, existing_file, naming
+from ._files import StrPath, atomic_path, check_suffix, existing_file, naming
 
 _BYTES_PER_VALUE = 24.0  # in double precision, while they are decoded
 
@@ -122,9 +122,10 @@ def write_png(
     - `exposure`: in stops: the values are multiplied by `2^exposure` before they are encoded.
       Values above 1 are clipped.
 
-    **Raises:** `ValueError` for another number of channels or an exposure that is not finite,
-    `FileNotFoundError` when the folder does not exist.
+    **Raises:** `ValueError` for another suffix than `.png`, another number of channels, or an
+    exposure that is not finite, `FileNotFoundError` when the folder does not exist.
     """
+    check_suffix(path, ".png")
     values = picture.beauty if isinstance(picture, Frame) else picture
     with naming(path):
         content = png_of(to_display(np.asarray(values), exposure))
@@ -219,8 +220,10 @@ def write_exr(
       are of row vectors: `[x y z 1] M`, divided by the last entry.
     - `half`: write half precision, except for depth and position.
 
-    **Raises:** `FileNotFoundError` when the folder does not exist.
+    **Raises:** `ValueError` for another suffix than `.exr`, `FileNotFoundError` when the folder
+    does not exist.
     """
+    check_suffix(path, ".exr")
     from splatjax import __version__  # known when the whole package is imported
 
     gaussians, channels = frame.weights.shape

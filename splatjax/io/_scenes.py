@@ -150,9 +150,9 @@ def _splats(table: Table) -> Splats:
     if "bust" in table.entries:
         splats = bust(int(table.number("bust")))
     else:
-        up, mm_per_unit = table.entries.get("up", "y"), table.number("mm_per_unit", 1.0)
-        unit: dict[str, Any] = {"mm_per_unit": mm_per_unit, "up": up}
         is_mesh = "mesh" in table.entries
+        mm_per_unit = table.number("mm_per_unit", None if is_mesh else 1.0)
+        unit: dict[str, Any] = {"mm_per_unit": mm_per_unit, "up": table.entries.get("up", "y")}
         body = table.folder / table.text("mesh" if is_mesh else "file")
         count = int(table.number("count", 200_000.0))
         splats = sample_mesh(body, count, **unit) if is_mesh else read_splats(body, **unit)

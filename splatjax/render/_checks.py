@@ -21,14 +21,14 @@ _CLOSED = 0.15
 _SOLID = 0.05  # least volume of a body (not a sheet), over that of a sphere of its area
 # Millimeters below which a material is opaque on purpose, as by `Material.opaque`.
 _OPAQUE = 2e-3
-# Size of a body over the distance that light travels below its surface, or the inverse.
+# Size of a body over the distance that light travels below its surface.
 _RATIO = 1000.0
 
 
 def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
     r"""Raise for channels that disagree or too little memory, and warn of causes of black or
-    meaningless pictures: no light, inverted normals, a camera inside the body, a body a thousand
-    times larger or smaller than the length scale of its material.
+    meaningless pictures: no light, inverted normals, a camera inside the body, a body smaller than
+    the distance that light travels in it, or a thousand times larger.
 
     For traced scenes, and scenes distributed over several processes, only the channels are checked.
     Each warning is shown once.
@@ -109,7 +109,7 @@ def _warnings(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
     if np.all(weights.sum(axis=0) > 0):
         reach = np.sqrt(np.max(variances @ weights / weights.sum(axis=0)))
         size = np.linalg.norm(np.ptp(centers, axis=0))
-        if reach > _OPAQUE and not 1 / _RATIO < size / reach < _RATIO:
+        if reach > _OPAQUE and not 1 < size / reach < _RATIO:
             yield (
                 f"the size of the body is {size:.3g} mm, and light travels {reach:.3g} mm "
                 "below its surface; check the units (mm), or scale the body by Splats.scaled"

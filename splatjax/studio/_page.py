@@ -4,6 +4,7 @@ which programs are also compiled, so that the page answers meanwhile.
 
 import contextlib
 import dataclasses
+import importlib.util
 import io
 import threading
 from collections.abc import Mapping, Sequence
@@ -41,6 +42,12 @@ _FACTORS = {"sigma_a": "absorption", "sigma_s_prime": "scattering"}
 _COLORS = ("#c0392b", "#27853f", "#2c5aa0")
 
 
+def check_viser() -> None:
+    """Raise `ValueError` where viser is not installed."""
+    if importlib.util.find_spec("viser") is None:
+        raise ValueError("the page of the studio needs viser; install it: pip install viser")
+
+
 class Page:
     """A session in a browser, or at the end of a notebook's cell. All pages that are open show one
     picture; the last camera that moves is that of all.
@@ -71,12 +78,9 @@ class Page:
         host: str = "127.0.0.1",
         port: int = 8080,
     ):
-        try:
-            import viser
-        except ImportError:
-            raise ValueError(
-                "the page of the studio needs viser; install it: pip install viser"
-            ) from None
+        check_viser()
+        import viser
+
         folder.mkdir(exist_ok=True)
         self._session, self._where = session, (folder, recipe or {})
         self._saves = list[tuple[str, Controls]]()

@@ -86,6 +86,7 @@ REFUSED = {
     "render plate.ply --environment missing.hdr": ["missing.hdr"],
     "render plate.ply --background environment --fill 0": ["--background", "no --environment"],
     "render plate.ply --environment map.png": ["map.png", "encoded for a display"],
+    "render missing.ply --environment studio --light-azimuth 30": ["--light-azimuth", "--env"],
     "render missing.ply --fill -1": ["--fill", "-1"],
     "render missing.ply --bounces -1": ["--bounces", "-1"],
     "render plate.ply --bounces 1 --stream 5": ["--bounces", "0 with --stream"],

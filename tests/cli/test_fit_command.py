@@ -148,11 +148,13 @@ def test_it_notes_too_much_light_and_too_few_radii(
     assert (noted is None and not notes) or any(noted in line for line in notes)
 
 
-def test_it_notes_channels_too_far_apart(fits_end_as, capsys):
+def test_it_notes_a_large_error_and_channels_too_far_apart(fits_end_as, capsys):
     fits_end_as(optx.RESULTS.successful)
-    for name, noted in (("ketchup", True), ("marble", False)):
+    for name, are_apart in (("ketchup", True), ("marble", False)):
         assert run("fit", name, "--model", "dipole") == 0
-        assert ("--error 0.05" in capsys.readouterr().err) == noted
+        noted = capsys.readouterr().err
+        assert "--error 0.05" in noted
+        assert ("far apart" in noted) == are_apart
 
 
 @pytest.mark.parametrize(

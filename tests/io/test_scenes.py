@@ -102,6 +102,7 @@ def test_a_scene_by_hand_names_files_beside_it(by_hand):
         ("mesh", "meshes", "[splats] has an unknown entry 'meshes'"),
         ('"body/box.stl"', "5", "[splats] mesh must be a name in quotes; it is 5"),
         ("box.stl", "none.stl", "none.stl"),
+        ("mm_per_unit = 10", "", "[splats] mm_per_unit"),
         ("count = 60", "count = 60\nscale = true", "[splats] scale"),
         ('"left 1.png"', '"7"', "has no camera '7'; give one of its 3 names"),
         ('file = "cameras/colmap"\nname', "position = [0, 0, 9]\nname", "[camera] rotation"),

@@ -196,7 +196,7 @@ FLIPPED = eqx.tree_at(lambda splats: splats.normals, sphere(2000), replace_fn=la
         (scene(lights=[sj.PointLight([0, 0, 50], 0)]), 50, "no light"),
         (scene(FLIPPED), 50, "normals of the splats point into the body"),
         (scene(), 3, "camera is inside the body"),
-        (scene(sphere(2000, 0.0002)), 50, "check the units"),
+        (scene(sphere(2000, 0.2)), 50, "check the units"),
         (scene(sphere(2000, 20_000.0)), 50_000, "check the units"),
     ],
 )
