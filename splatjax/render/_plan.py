@@ -129,7 +129,7 @@ def make_plan(
         diffusion=settings.diffuser.make_plan(parts, variances, settings.kernel, interval),
         interval=interval,
         splatting=splatting,
-        raster=raster.fitted(parts, views, settings.splatting),
+        raster=raster.fitted(parts, views, splatting),
         sightlines=_splatting.Sightlines.build(parts, settings.sightlines)
         if settings.bounces
         else None,

@@ -18,7 +18,7 @@ from ._rasterizer import (
     fragment_weight,
     least_weight,
 )
-from ._views import OPEN, AbstractView, SplattingSettings
+from ._views import AbstractView, SplattingSettings
 
 
 class DenseRasterizer(AbstractRasterizer):
@@ -79,7 +79,7 @@ class DenseRasterPlan(AbstractRasterPlan):
             in_front = summed(front)
             # Behind it, in pixels that it leaves open: the same among all others, from the nearest
             # that weighs something.
-            is_open = jax.lax.stop_gradient(in_front[-1]) < OPEN
+            is_open = jax.lax.stop_gradient(in_front[-1]) < settings.hidden_from
             behind = inside & ~front & is_open[:, None]
             weighty = nearest(behind & (weight > least[None]))
             limit = jnp.where(weighty > -jnp.inf, weighty, nearest(behind))

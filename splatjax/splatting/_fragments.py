@@ -228,25 +228,28 @@ class Listed(eqx.Module):
 
     **Attributes:**
 
+    - `hidden_from`: the weight sum of a front from which on nothing is seen behind it.
     - `numbers`: `NUMBERS` and shift of every splat, and of the one that empty slots refer to.
     - `attributes`: of every splat.
     """
 
     bins: Bins
+    hidden_from: Float[Array, ""]
     numbers: Float[Array, "splats_and_one numbers"]
     attributes: Float[Array, "splats attributes"]
 
     @classmethod
     def of(
         cls,
+        hidden_from: Float[Array, ""],
+        bins: Bins,
         shift: Float[Array, " splats"],
         numbers: tuple[Float[Array, " splats"], ...],
         attributes: Float[Array, "splats attributes"],
-        bins: Bins,
     ) -> "Listed":
         rows = jnp.stack([*numbers, shift], axis=1)
         empty = jnp.asarray([_EMPTY], rows.dtype)
-        return cls(bins, jnp.concatenate([rows, empty]), attributes)
+        return cls(bins, hidden_from, jnp.concatenate([rows, empty]), attributes)
 
 
 def _number_cotangents(splats, quad, near):

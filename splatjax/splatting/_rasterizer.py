@@ -14,7 +14,7 @@ from splatjax._combination import AbstractCombination
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats
 
-from ._views import AbstractView, SplattingSettings
+from ._views import CLOSED, AbstractView, SplattingSettings
 
 _AT_RIM = math.exp(-4.0)
 
@@ -65,11 +65,6 @@ def fast_fragment_weight(squared_radius: Float[Array, "..."]) -> Float[Array, ".
         root = root * squared_radius + coefficient
     root = root * (1 - squared_radius)
     return root * root
-
-
-# The weight sum that covers a pixel inside a surface. Splats whose radius is 1.5 times the root of
-# their area, scattered at random, have at least 0.2 inside a closed surface.
-CLOSED = 0.15
 
 
 def coverage(

@@ -16,9 +16,9 @@ from splatjax.scene import Splats, rotation_towards
 from ._grid import TILE_SIDE, TileGrid
 from ._groups import MERGED_COUNTS
 from ._projections import OrthographicView, PerspectiveView
-from ._rasterizer import CLOSED, AbstractRasterPlan, FragmentSums, coverage, invalid_factor
+from ._rasterizer import AbstractRasterPlan, FragmentSums, coverage, invalid_factor
 from ._surfaces import Surface
-from ._views import AbstractView, SplattingSettings
+from ._views import CLOSED, AbstractView, SplattingSettings
 
 # The weight sum that covers a pixel of a map. Discs extend beyond an open edge; a larger sum than
 # in pictures makes its shadow extend less. Evenly spread splats always exceed a sum of 1.
@@ -228,6 +228,7 @@ def make_shadow_map(
     """
     chosen, needed = plan.choose(splats, view)
     no_rows = jnp.zeros((0, len(chosen)), splats.centers.dtype)
+    splatting = dataclasses.replace(splatting, full_coverage=_COVERED)
     sums = plan.sum_fragments(splats.take(chosen), no_rows, view, splatting, combination)
     needed = combination.largest([jnp.maximum(needed, sums.needed)])
     total = combination.total([sums.sums])

@@ -14,14 +14,13 @@ from splatjax.scene import Splats
 
 from ._grid import TILE_SIDE, TileGrid
 from ._rasterizer import (
-    CLOSED,
     AbstractRasterPlan,
     FragmentSums,
     PixelSums,
     coverage,
     invalid_factor,
 )
-from ._views import AbstractView, SplattingSettings
+from ._views import CLOSED, AbstractView, SplattingSettings
 
 TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2  # of a chunk, for what is computed chunk by chunk
 _BESIDE = 2  # pixels from an open one: as far as outlines are filtered

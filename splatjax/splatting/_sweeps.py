@@ -29,7 +29,6 @@ from ._bins import Bins
 from ._fragments import NUMBERS, Lanes, Listed, Sweep, second_limits
 from ._grid import TILE_SIDE
 from ._rasterizer import FragmentSums, PixelSums, SurfaceCapacity
-from ._views import OPEN
 
 
 class Spans(eqx.Module):
@@ -92,17 +91,19 @@ def sum_tile_fragments(
     sweep: Sweep,
     capacity: SurfaceCapacity,
     combination: AbstractCombination,
+    hidden_from: Float[Array, ""],
     bins: Bins,
     shift: Float[Array, " splats"],
     numbers: tuple[Float[Array, " splats"], ...],
     attributes: Float[Array, "splats attributes"],
 ) -> FragmentSums:
     """Sum attributes over the splats of every tile: this device's part of the sums."""
-    return _sum_fwd(sweep, capacity, combination, bins, shift, numbers, attributes)[0]
+    listed = hidden_from, bins, shift, numbers, attributes
+    return _sum_fwd(sweep, capacity, combination, *listed)[0]
 
 
-def _sum_fwd(sweep, capacity, combination, bins, shift, numbers, attributes):
-    part = PartSweep(sweep, Listed.of(shift, numbers, attributes, bins))
+def _sum_fwd(sweep, capacity, combination, *listed):
+    part = PartSweep(sweep, Listed.of(*listed))
     ((sums, spans),) = sum_parts(lambda: [[part]], [capacity], combination)
     return sums, (part, spans)
 
@@ -121,7 +122,7 @@ def _sum_bwd(sweep: Sweep, capacity: SurfaceCapacity, combination, residuals, co
     rows = spans.far_limit, spans.near_limit, cotangent
     gradients = part.each_round(spans.tiles, rows, add, gradients)[:-1]
     of_numbers = tuple(jnp.moveaxis(gradients[:, :fields], 1, 0))
-    return None, None, of_numbers, gradients[:, fields:]
+    return None, None, None, of_numbers, gradients[:, fields:]
 
 
 sum_tile_fragments.defvjp(_sum_fwd, _sum_bwd)
@@ -230,7 +231,7 @@ def sum_parts(
     opened = []
     for k, capacity in enumerate(capacities):
         sweep = first[k].sweep
-        is_open = weights[k] < OPEN
+        is_open = weights[k] < first[k].listed.hidden_from
         opened.append(fronts[k].opened(is_open, capacity.behind, sweep.grid.count))
     tiles, near_limits, open_limits, needed = zip(*opened, strict=True)
     limits = combination.largest(

@@ -164,17 +164,18 @@ class TilePlan(AbstractRasterPlan):
         """
         chosen, _ = self.choose(splats, view)
         seen = splats.take(chosen), take_points(attributes, chosen)
-        sweep, bins, *binned = self._bin(*seen, view, settings)
-        return PartSweep(sweep, Listed.of(*binned, bins))
+        sweep, *binned = self._bin(*seen, view, settings)
+        return PartSweep(sweep, Listed.of(*binned))
 
     def _bin(self, splats: Splats, attributes, view: AbstractView, settings: SplattingSettings):
         """Project the splats, and list them by tile. Returns the input of a sweep: its settings,
-        the lists, and the shifts, numbers and attributes of the splats.
+        the weight sum that hides, the lists, and the shifts, numbers and attributes of the splats.
         """
         grid = self.rasterizer.grid(view)
         footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
         return (
             Sweep(type(view), grid, settings.filter_radius),
+            settings.hidden_from.astype(splats.centers.dtype),
             bin_items(footprints.ranges(grid), grid, self.bins),
             jax.lax.stop_gradient(footprints.shift),
             tuple(getattr(footprints, name) for name in NUMBERS),

@@ -25,8 +25,9 @@ from ._grid import TileGrid, TileRanges
 # Cosine to the line of sight, below which float32 cannot determine the visible side of a splat.
 EDGE_ON = 1e-5
 _SLOPE_FILTER = 0.25  # pixels; see `widen_ellipse`
-# The largest weight sum of full coverage: what is behind a front of less is summed.
-OPEN = 1.0
+# The weight sum that covers a pixel inside a surface. Splats whose radius is 1.5 times the root of
+# their area, scattered at random, have at least 0.2 inside a closed surface.
+CLOSED = 0.15
 # Unevenness of splats, and the fraction of their mean weight sum that covers a pixel.
 _EVEN, _SCATTERED = (0.1, 0.75), (0.35, 0.11)
 _MEAN_WEIGHT = (1 - 13 * math.exp(-4)) / 4  # `fragment_weight` over a disc
@@ -53,7 +54,7 @@ class SplattingSettings(eqx.Module):
     def __check_init__(self):
         if self.full_coverage is not None:
             name = "SplattingSettings.full_coverage"
-            check_values(name, self.full_coverage, "in (0, 1]", lambda x: (x > 0) & (x <= OPEN))
+            check_values(name, self.full_coverage, "in (0, 1]", lambda x: (x > 0) & (x <= 1))
 
     @property
     def covered_from(self) -> float | Float[Array, ""]:
@@ -63,6 +64,11 @@ class SplattingSettings(eqx.Module):
                 "full_coverage depends on the splats; call settings.measured(unevenness, discs)"
             )
         return self.full_coverage
+
+    @property
+    def hidden_from(self) -> Float[Array, ""]:
+        """The weight sum of a front from which on nothing is seen behind it."""
+        return jnp.maximum(jnp.asarray(self.covered_from), CLOSED)
 
     def measured(
         self, unevenness: Float[Array, ""], discs: Float[Array, ""]
@@ -83,7 +89,7 @@ class SplattingSettings(eqx.Module):
         (even, fraction_even), (scattered, fraction_scattered) = _EVEN, _SCATTERED
         share = jnp.clip((unevenness - even) / (scattered - even), 0, 1)
         fraction = fraction_even + share * (fraction_scattered - fraction_even)
-        full = jnp.minimum(fraction * _MEAN_WEIGHT * math.pi * discs, OPEN)
+        full = jnp.minimum(fraction * _MEAN_WEIGHT * math.pi * discs, 1.0)
         return dataclasses.replace(self, full_coverage=full)
 
 

@@ -281,10 +281,13 @@ def test_an_edge_hides_nothing_behind_it_however_small_the_splats(kind, rasteriz
     assert np.min(both) > 1 - 1e-6
 
 
+def by_default(body) -> SplattingSettings:
+    """The settings of splats whose radius is 1.5 times the root of their area."""
+    return SplattingSettings().measured(unevenness(body), jnp.asarray(1.5**2))
+
+
 def covered(view, body) -> np.ndarray:
-    """The coverage by splats whose radius is 1.5 times the root of their area."""
-    settings = SplattingSettings().measured(unevenness(body), jnp.asarray(1.5**2))
-    return np.asarray(seen_through(drawn(view, body, None, "tiles", settings))[1], float)
+    return np.asarray(seen_through(drawn(view, body, None, "tiles", by_default(body)))[1], float)
 
 
 @pytest.mark.once
@@ -304,9 +307,14 @@ def test_an_outline_is_where_the_body_ends_and_is_antialiased(size):
 @pytest.mark.parametrize("jitter", [0.1, 0.35])
 def test_a_surface_is_covered_however_evenly_its_splats_are_spread(jitter):
     view = bodies.perspective(width=96, height=96)
-    coverage = covered(view, bodies.sphere(20_000, 25.0, jitter=jitter))
+    body = bodies.sphere(20_000, 25.0, jitter=jitter)
+    coverage = covered(view, body)
     assert np.all(coverage > 0)
     assert np.mean(coverage < 0.99) < 5e-4
+    # Where nothing is seen through it, nothing is looked for behind it.
+    settings, rasterizer = by_default(body), TileRasterizer(lanes=4, slots=4)
+    plan = rasterizer.make_plan([body], [view], settings).fitted([body], [view], settings)
+    assert plan.places.behind < plan.places.front / 4
 
 
 @pytest.mark.once

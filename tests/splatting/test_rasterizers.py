@@ -27,7 +27,6 @@ from splatjax.splatting import (
     bin_items,
     make_shadow_map,
 )
-from splatjax.splatting._views import OPEN
 
 WIDTH, HEIGHT = 21, 18
 IN_SUITE = 45
@@ -100,7 +99,7 @@ def compare(count: int, perspective: bool, off, bounds: tuple[float, float]) -> 
         assert float(needed) <= 1
         weights = plain[0]["front weights"]
         behind += int(jnp.sum(plain[0]["behind weights"] > 0))
-        most_open = max(most_open, open_tiles(weights, OPEN))
+        most_open = max(most_open, open_tiles(weights, float(SETTINGS.hidden_from)))
         assert seed >= len(KINDS) or KINDS[seed] not in UNSEEN or not np.any(weights)
         for bound, ours, theirs in zip(bounds, fast, plain, strict=True):
             for name, expected in theirs.items():
