@@ -24,7 +24,6 @@ from ._views import CLOSED, AbstractView, SplattingSettings
 
 TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2  # of a chunk, for what is computed chunk by chunk
 _BESIDE = 2  # pixels from an open one: as far as outlines are filtered
-_TINY = 1e-8
 
 
 def blend_fragments(
@@ -52,8 +51,7 @@ def coverages(
     Each covers a smooth step of the sum of its weights, the one behind of the part that the front
     leaves. Beside the background, which is within two pixels of one that both leave open, the step
     ends at `full`, so that outlines are where the body ends. Elsewhere it ends at a sum that
-    surfaces keep in creases, and between splats scattered at random; of what both cover there, the
-    front has a share that ends at `full` too, or all if nothing is behind it.
+    surfaces keep in creases, and between splats scattered at random: nothing shines through there.
 
     **Arguments:** `front`, `behind`: sums of weights. Differentiable.
     """
@@ -65,12 +63,8 @@ def coverages(
     window = 1, 2 * _BESIDE + 1, 2 * _BESIDE + 1
     beside = jax.lax.reduce_window(is_open, -jnp.inf, jax.lax.max, window, (1, 1, 1), "SAME")
     closed = CLOSED + grid.cut(beside)[:, 0] * (full - CLOSED)
-    both = over(coverage(front, closed), coverage(behind, closed))
-    of_front = coverage(front, full)
-    total = over(of_front, coverage(behind))
-    exists = total > _TINY
-    of_front = both * jnp.where(exists, of_front / jnp.where(exists, total, 1.0), 1.0)
-    return of_front, both - of_front
+    of_front = coverage(front, closed)
+    return of_front, (1 - of_front) * coverage(behind, closed)
 
 
 class Surface(eqx.Module):

@@ -23,6 +23,8 @@ from splatjax.splatting import (
     coverage,
     fragment_weight,
 )
+from splatjax.splatting._grid import TileGrid
+from splatjax.splatting._surfaces import coverages
 
 # In pixels so fine, the quarter pixel that keeps slopes finite is nothing.
 FINE = {"width": 40_000, "height": 32_000}
@@ -345,3 +347,12 @@ def test_coverage_of_a_silhouette_is_differentiable(float64):
 def test_full_coverage_that_no_surface_has_is_refused(full):
     with pytest.raises(ValueError, match="full_coverage"):
         SplattingSettings(full_coverage=full)
+
+
+def test_nothing_shines_through_a_crease():
+    """Far from the background, whatever lies behind a front of little weight."""
+    grid = TileGrid(40, 40)
+    weights = jnp.full((2, grid.count, 64), 0.5).at[1].set(2.0)
+    of_front, of_behind = coverages(*weights, grid, 0.9)
+    np.testing.assert_array_equal(of_front, 1)
+    np.testing.assert_array_equal(of_behind, 0)
