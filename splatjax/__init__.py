@@ -7,10 +7,10 @@ submodules:
 - `scattering`: media, slabs and their profiles; `transport`: the Monte Carlo reference.
 - `fitting`: fits of sums of Gaussians; `gaussians`: profiles and sums of Gaussians.
 - `inverse`: materials and scenes from pictures.
-- `scene`, `geometry`: records, area lights, skies; bodies; `io`: files; `exports`: fits for other
-  renderers.
+- `scene`: cameras, lights, materials and frames; `geometry`: bodies.
+- `io`: files; `exports`: materials for other renderers.
 - `splatting`, `diffusion`, `shading`: the passes, and their settings.
-- `cache`: cached results for the next start of a program.
+- `cache`: keeps results and compiled pictures for the next start of a program.
 
 `splatjax.baselines` (methods to compare with), `splatjax.plots` (which needs matplotlib) and
 `splatjax.studio` (a scene that changes live) must be imported explicitly.

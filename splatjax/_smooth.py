@@ -20,10 +20,10 @@ def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
     **Arguments:**
 
     - `albedo`: diffuse color, linear, in [0, 1]. Differentiable; the gradient is `1 / (2
-      sqrt(albedo))` above the floor and 0 at and below it, since that of the root itself diverges
-      at a black texel.
+      sqrt(albedo))` above the floor and 0 at and below it, since the derivative of the root itself
+      diverges at a black texel.
 
-    **Returns:** at least 0.01; its square is the albedo, but for texels darker than 1e-4.
+    **Returns:** at least 0.01; its square is the albedo, except for texels darker than 1e-4.
 
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14): pre- and post-scatter texturing in
     equal parts.

@@ -69,14 +69,14 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
 
     **Arguments:**
 
-    - `folder`: created if missing. By default that of the command line: `splatjax/jax` in the
+    - `folder`: created if missing. By default the folder of the command line: `splatjax/jax` in the
       absolute path `XDG_CACHE_HOME`, or in `~/.cache`. It may be deleted at any time; besides JAX's
       own files it takes 1 GB at most.
 
-    **Returns:** the folder in it for this kind of processor.
+    **Returns:** the subfolder for this kind of processor.
 
-    **Raises:** `OSError` when it cannot be made; `PermissionError` when `kept` in it belongs to
-    another user, or others may write to it; then only JAX's cache is used.
+    **Raises:** `OSError` when the folder cannot be made; `PermissionError` when `kept` in it
+    belongs to another user, or others may write to it; then only JAX's cache is used.
     """
     global _folder
     for name, value in _SETTINGS.items():
@@ -97,9 +97,11 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
 
 
 def reuse_capacity(kind: Hashable, least: int, capacity: int, most: float = 1.25) -> int:
-    """Return the smallest capacity that this process has planned for arrays of a kind, if it is at
-    least `least` and at most `most` times `capacity`, since programs of that size are compiled;
-    otherwise remember and return `capacity`.
+    """Return a capacity for arrays of a kind, if possible one for which programs are compiled
+    already.
+
+    That is the smallest capacity that this process has planned before, from `least` up to `most`
+    times `capacity`. If there is none, `capacity` is remembered and returned.
 
     With several processes, which must run the same programs, nothing is remembered.
     """

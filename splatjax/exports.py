@@ -14,12 +14,13 @@ from splatjax.scattering import HalfSpace, Medium, diffuse_scaling
 
 
 def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
-    r"""Compute the `d` of normalized diffusion, `(exp(-r/d) + exp(-r/3d)) / (8 pi d r)`, that has
-    the same mean distance. It is the scattering distance of Unity's High Definition Render
-    Pipeline, whose shape parameter is `1 / d`.
+    r"""Compute the length `d` with which normalized diffusion, `(exp(-r/d) + exp(-r/3d)) / (8 pi d
+    r)`, has the same mean distance as the Gaussians. It is the scattering distance of Unity's High
+    Definition Render Pipeline, whose shape parameter is `1 / d`.
 
-    Its mean distance is `2.5 d`; that of the Gaussians is `sum_i w_i sqrt(pi v_i / 2) / sum_i w_i`.
-    The curves differ: normalized diffusion is infinite at the origin.
+    The mean distance of normalized diffusion is `2.5 d`, and that of the Gaussians is `sum_i w_i
+    sqrt(pi v_i / 2) / sum_i w_i`. The curves differ: normalized diffusion is infinite at the
+    origin.
 
     **Arguments:**
 
@@ -27,21 +28,20 @@ def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
 
     **Returns:** mm.
 
-    **Source:** the profile is that of Christensen and Burley 2015; matching the mean distance is
-    ours.
+    **Source:** the profile: Christensen and Burley 2015; matching the mean distance is ours.
     """
     distances = jnp.sqrt(0.5 * jnp.pi * gaussians.variances)
     return distances @ gaussians.weights / (2.5 * gaussians.total_reflectance())
 
 
 def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
-    r"""Compute the radius for Blender's method Christensen-Burley, at scale 1: `4 pi s(A) d`, where
-    A is the total reflectance.
+    r"""Compute the radius for Blender's method Christensen-Burley, at scale 1: `4 pi s(A) d`, with
+    the total reflectance A and the `d` of `burley_distance`.
 
-    Cycles uses a quarter of the radius over pi as the mean free path l, and then `d = l / s(A)`
-    with the curve for diffuse transmission.
+    Cycles uses `l = radius / (4 pi)` as the mean free path, and then `d = l / s(A)`, with the curve
+    `s` for diffuse transmission (`diffuse_scaling`).
 
-    **Returns:** mm; in Blender's unit of length, the meter, a thousandth of that.
+    **Returns:** mm; divide by 1000 for Blender's unit of length, the meter.
 
     **Source:** Blender Foundation, Cycles, `kernel/closure/bssrdf.h`; Christensen and Burley 2015,
     Eq. 6.
@@ -52,8 +52,8 @@ def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
 def openpbr_subsurface(medium: Medium) -> dict[str, Float[Array, ""] | Float[Array, " channels"]]:
     r"""Compute the subsurface parameters of OpenPBR: the inverse of `HalfSpace.of_color`.
 
-    The color is that of a flat surface whose index reflects light back into the body; OpenPBR's own
-    formula omits this, and agrees to 0.6% for equal indices.
+    The color is the color of a flat surface whose index reflects light back into the body.
+    OpenPBR's own formula omits this reflection, and agrees to 0.6% for equal indices.
 
     **Arguments:**
 
@@ -84,9 +84,9 @@ def separable_kernel(
     screen.
 
     Offsets are denser toward the middle, `reach sign(t) t^2` for equally spaced `t` from -1 to 1; a
-    weight is the profile at the offset times half the distance between the neighbors, and those of
-    a channel add up to 1. Two such blurs in turn are not the radial profile, unless it is one
-    Gaussian.
+    weight is the profile at the offset times half the distance between the neighbors, and the
+    weights of a channel add up to 1. Two such blurs in turn are not the radial profile, unless it
+    is one Gaussian.
 
     **Arguments:**
 

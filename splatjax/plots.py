@@ -40,17 +40,17 @@ def plot_fit(
     r"""Draw a profile and its fit, on linear and on logarithmic axes, and the relative error of the
     fit by distance.
 
-    Three channels are drawn in red, green and blue; the single
-    Gaussians of the fit, with the mean weight of the channels, in gray. Of a measurement each
-    radius is marked. The legend gives the error (Eq. 4) and the energy of the fit relative to the
-    profile's, minus 1: held, if that is rounding.
+    Three channels are drawn in red, green and blue; the single Gaussians of the fit, with the mean
+    weight of the channels, in gray. Each radius of a measurement is marked. The legend gives the
+    error (Eq. 4), and the energy of the fit divided by the energy of the profile, minus 1; "held"
+    if the two are equal up to rounding.
 
     **Arguments:**
 
     - `profile`: the reference, 1/mm^2.
     - `gaussians`: the fit, with as many channels.
-    - `rule`: that of the fit. Radii before it begins are shaded, and do not count.
-    - `title`: of the figure.
+    - `rule`: the rule of the fit. Radii before it begins are shaded, and do not count.
+    - `title`: title of the figure.
 
     **Returns:** a matplotlib `Figure`, which no window shows; `figure.savefig(path)` writes it.
     """
@@ -141,12 +141,13 @@ def _colors(channels: int) -> Sequence[str]:
 
 
 def plot_error_by_count(by_count: ErrorByCount, *, title: str | None = None) -> Figure:
-    r"""Draw the error (Eq. 4) of each channel over the number of Gaussians, on a logarithmic axis.
+    r"""Draw the error (Eq. 4) of each channel against the number of Gaussians, on a logarithmic
+    axis.
 
     **Arguments:**
 
-    - `by_count`: of `error_by_count`.
-    - `title`: of the figure.
+    - `by_count`: result of `error_by_count`.
+    - `title`: title of the figure.
 
     **Returns:** a matplotlib `Figure`, which no window shows; `figure.savefig(path)` writes it.
     """
@@ -174,10 +175,10 @@ def plot_pictures(
 
     **Arguments:**
 
-    - `rows`: of pictures `[height, width, 3]`, premultiplied by their coverage, as those of a
-      `Frame` are.
-    - `titles`: of the columns.
-    - `names`: of the rows.
+    - `rows`: rows of pictures `[height, width, 3]`, premultiplied by their coverage, as in a
+      `Frame`.
+    - `titles`: titles of the columns.
+    - `names`: names of the rows.
     - `white`: value that is shown as white. By default each row has its own exposure: of its values
       above zero 0.5% are brighter than white.
     - `inches`: height of a picture.
@@ -207,13 +208,13 @@ def plot_pictures(
 def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
     r"""Draw each observed picture, the recovered one, and the difference.
 
-    Pixels that do not count are gray. The difference is the mean of the channels, over the
+    Pixels that do not count are gray. The difference is the mean of the channels, divided by the
     picture's root mean square.
 
     **Arguments:**
 
-    - `recovery`: of `recover`.
-    - `title`: of the figure.
+    - `recovery`: result of `recover`.
+    - `title`: title of the figure.
 
     **Returns:** a matplotlib `Figure`, which no window shows; `figure.savefig(path)` writes it.
     """

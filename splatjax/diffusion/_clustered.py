@@ -41,8 +41,8 @@ class ClusterDiffuser(AbstractDiffuser):
 
     - `error`: median error of a layer over its points, relative to the layer's root mean square,
       for light that varies within the layer's width; the 99th percentile is five times as large.
-      Half of it is spent on truncation. With 0, nothing is merged and 4e-5 of the power is
-      truncated.
+      Half of it is caused by truncating the Gaussians. With 0 no splats are merged, and only 4e-5
+      of the power is cut off.
     - `margin`: factor on the planned variances within which a plan is valid.
     """
 
@@ -102,8 +102,8 @@ class ClusterDiffuser(AbstractDiffuser):
         - `spacing`: root of the mean area of the splats, mm.
         - `fine`: area that only `FINE_QUANTILE` of the splats are finer than, mm^2.
 
-        **Returns:** of each its Gaussian, the variance (mm^2), the edge of its cells (mm; 0 for
-        single splats), and the support (standard deviations).
+        **Returns:** for each layer its Gaussian, the variance (mm^2), the edge of its cells (mm; 0
+        for single splats), and the support (standard deviations).
         """
         inputs = (jnp.asarray(value, interval.dtype) for value in (variances * self.margin, fine))
         shares = np.asarray(eqx.filter_jit(resolved_fraction)(*inputs, interval), np.float64)
@@ -124,10 +124,10 @@ class ClusterPlan(AbstractDiffusionPlan):
 
     **Attributes:**
 
-    - `sources`: of every layer: splats, or clusters of them.
-    - `kernels`: of every layer.
-    - `variances`, `margin`: the plan is valid for variances within this factor of these, mm^2, or
-      of the first of them.
+    - `sources`: the sources of every layer: splats, or clusters of splats.
+    - `kernels`: the kernel of every layer.
+    - `variances`, `margin`: the plan is valid for variances (mm^2) within the factor `margin` of
+      `variances`, or of the first of them.
     """
 
     sources: LayerSources

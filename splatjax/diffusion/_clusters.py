@@ -171,8 +171,8 @@ def _split_by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
 
 
 def compact_order(points: np.ndarray) -> np.ndarray:
-    """Find the order `[points]` of a k-d tree whose leaves hold a block of points, but the last,
-    and are sorted down to quarters of it.
+    """Find the order `[points]` of a k-d tree whose leaves hold a block of points, except for the
+    last, and are sorted down to quarters of a block.
 
     **Arguments:** `points`: `[points, 3]`.
     """

@@ -25,7 +25,7 @@ class Sources(eqx.Module):
 
     **Attributes:**
 
-    - `irradiance`: of all layers, or of each.
+    - `irradiance`: the irradiance that spreads: one for all layers, or one for each.
     - `weights`: factors of the splats on the weights of the material; `None` for 1.
     """
 
@@ -55,9 +55,9 @@ class Beams(eqx.Module):
 
     **Attributes:** (differentiable)
 
-    - `irradiance`: that enters, after the loss at the surface.
-    - `directions`: of the light inside, the mean displacement of the first scattering per mean free
-      path: unit for one light, shorter for several.
+    - `irradiance`: the irradiance that enters, after the loss at the surface.
+    - `directions`: the mean directions of the light inside (mean displacement of the first
+      scattering, per mean free path): unit for one light, shorter for several.
     """
 
     irradiance: Float[Array, "channels splats"]
@@ -72,7 +72,7 @@ class LayerValues(eqx.Module):
     - `values`: for each channel the weighted mean of the irradiance nearby, which keeps constants,
       is between the least and the greatest irradiance, and is linear in it; last the mass of the
       kernel on the surface, 1 on a flat sheet. Or the radiant exitance of each channel alone.
-    - `slopes`: of the values in space, 1/mm.
+    - `slopes`: the slopes of the values in space, 1/mm.
     """
 
     values: Float[Array, "*layers values points"]
@@ -84,8 +84,8 @@ class Diffused(eqx.Module):
 
     **Attributes:**
 
-    - `layers`: in the order of `AbstractDiffusionPlan.gaussians`.
-    - `needed`: capacity needed over planned; above 1 the values are incomplete.
+    - `layers`: the layers, in the order of `AbstractDiffusionPlan.gaussians`.
+    - `needed`: needed capacity divided by planned capacity; above 1 the values are incomplete.
     """
 
     layers: LayerValues
@@ -121,8 +121,9 @@ class AbstractDiffusionPlan(eqx.Module):
         return dataclasses.replace(material, medium=None)
 
     def shown(self, scene: Scene) -> Scene:
-        """Return the scene whose weights apply to the layers that passes 2 and 3 blend: its own, or
-        the weight 1 of a layer that all splats resolve, where `light` has applied them.
+        """Return the scene with the weights of the layers that passes 2 and 3 blend: unchanged, or,
+        where `light` has applied the weights already, with one layer of weight 1 that all splats
+        resolve.
         """
         if self.separate:
             return scene
@@ -148,7 +149,7 @@ class AbstractDiffusionPlan(eqx.Module):
 
         **Arguments:**
 
-        - `sources`: in the order of the plan. Differentiable.
+        - `sources`: the splats as sources, in the order of the plan. Differentiable.
         - `variances`: mm^2. Differentiable.
         - `combination`: combines the parts of the splats of several devices.
         - `at`: the splats at which the layers are evaluated, in ascending order, padded by the
@@ -204,7 +205,7 @@ class AbstractDiffusionPlan(eqx.Module):
         combination: AbstractCombination,
         at: Int[Array, " points"] | None = None,
     ) -> tuple[Diffused, Diffused]:
-        """Diffuse, and differentiate each layer in the logarithm of its own variance."""
+        """Diffuse, and differentiate each layer with respect to the logarithm of its variance."""
 
         plan = dataclasses.replace(self, forward_mode=True)
 
@@ -230,14 +231,16 @@ class AbstractDiffuser(eqx.Module):
         kernel: AbstractDiffusionKernel,
         interval: Float[Array, "2"],
     ) -> AbstractDiffusionPlan:
-        """Find what evaluating these variances on this geometry needs. Not for traced arrays.
+        """Plan the evaluation of Gaussians of these variances on this geometry. Not for traced
+        arrays.
 
         **Arguments:**
 
         - `parts`: the splats, each part in the compact order in which they will be diffused
           (`compact_order`) and filled up to whole blocks by splats without area; several parts
           where several devices hold them.
-        - `interval`: from `AbstractDiffusionKernel.interval`.
+        - `interval`: standard deviations per spacing between which layers become resolved
+          (`AbstractDiffusionKernel.interval`).
         """
 
 

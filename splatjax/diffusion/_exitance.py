@@ -26,10 +26,10 @@ class ExitanceDiffuser(AbstractDiffuser):
     one radiant exitance with its slopes, instead of means, mass and slopes for each layer. A frame
     takes three quarters of the time, a further frame of an orbit half.
 
-    The gain of the kernel is that of each splat, also along its slopes. The picture hardly differs
-    inside; along outlines it does by a few percent where pixels are wider than splats.
-    `Frame.layers` has the sum alone, with a weight of 1, and `Frame.unresolved_fraction` is 0.
-    Derivatives by Gaussians (`diffusion_basis`, `picture_jacobian`) need separate layers.
+    Each splat has one gain of the kernel, also along its slopes. The picture hardly differs inside;
+    along outlines it differs by a few per cent where pixels are wider than splats. `Frame.layers`
+    has the sum alone, with a weight of 1, and `Frame.unresolved_fraction` is 0. Derivatives by
+    Gaussians (`diffusion_basis`, `picture_jacobian`) need separate layers.
 
     **Attributes:**
 

@@ -107,7 +107,7 @@ class AbstractDiffusionKernel(eqx.Module):
 
     def support(self, error: float, share: float) -> float:
         """Choose the radius, in standard deviations, beyond which half of `error` of a layer's
-        power is, if the diffusion integral is only a `share` of the layer.
+        power lies, if the diffusion integral is only a `share` of the layer.
         """
         truncated = max(0.5 * error / max(share, _LEAST_SHARE), _LEAST_TRUNCATED)
         return math.sqrt(2 * math.log(1 / min(truncated, _MOST_TRUNCATED)))
@@ -131,13 +131,14 @@ class AbstractDiffusionKernel(eqx.Module):
         energies: Float[Array, "gaussians channels *points"],
         single_scattering_albedo: Float[Array, "channels *points"],
     ) -> Float[Array, "gaussians #channels *points"]:
-        r"""Compute the factor of each layer on the mean over the splats near a point.
+        r"""Compute the factor of each layer on its mean over the splats near a point.
 
         **Arguments:**
 
-        - `mass`: of the kernel on the surface, `sum_j A_j G(v_k, |x - q_j|)` over its value on a
-          flat sheet: 1 there, 2 in a sheet much thinner than the layer is wide, less at open edges.
-        - `variances`: mm^2; those of each point, or of all.
+        - `mass`: the mass of the kernel on the surface, `sum_j A_j G(v_k, |x - q_j|)`, divided by
+          its mass on a flat sheet: 1 on a flat sheet, 2 in a sheet much thinner than the layer is
+          wide, less at open edges.
+        - `variances`: mm^2, for each point or for all.
         - `energies`: weights times the albedo at the point: the fraction of the light that leaves a
           flat surface as each layer.
         - `single_scattering_albedo`: the fraction that leaves as single scattering.
@@ -157,19 +158,24 @@ class PlainMean(AbstractDiffusionKernel):
 class EscapeNormalization(AbstractDiffusionKernel):
     r"""A kernel for which light escapes sooner from thin or convex parts, so that less is absorbed.
 
-    Below a flat surface diffused light decays as `exp(-kappa z)`, and below one of mean curvature
-    H as if its rate were `kappa - H`, down to 0. The total reflectance of a sum of Gaussians at
-    another rate, for the same scattering, is `sum_k w_k exp(v_k (kappa^2 - rate^2) / 2)`. Each
-    layer is therefore multiplied by
+    This is the default. It corrects the color of ears, noses and other thin or strongly curved
+    parts, which the plain mean of the paper gives the color of a flat surface.
+
+    At the depth `z` below a flat surface diffused light decays as `exp(-kappa z)`. Below a surface
+    of mean curvature `H` it decays more slowly, as if the rate were `kappa - H` (at least 0), so
+    less is absorbed. In a sum of Gaussians with weights `w_k` and variances `v_k`, another rate in
+    place of `kappa`, for the same scattering, multiplies each weight by `exp(v_k (kappa^2 - rate^2)
+    / 2)`. Each layer is therefore multiplied by
 
         gain_k = exp(v_k (kappa H_k - H_k^2 / 2)),   H_k <= kappa
 
-    The rate is that of a reflectance `1 / (1 + c kappa)`: `kappa^2 = (1 - W) / v`, where `W` is the
-    fraction of light that leaves a flat surface, and `v` the mean variance of the layers, weighted
-    by their energies. The curvature follows from `S_k`, the kernel mass on the surface over that of
-    a flat sheet: `H_k = (1 - 1 / S_k) / (depth sqrt(v_k))`, which is exact on spheres that are
-    large against the layer. On a sheet much thinner than the layer is wide `S_k` is 2. A layer too
-    wide for its body uses the greatest mass of the narrower ones.
+    The rate follows from the Gaussians, `kappa^2 = (1 - W) / v`, where `W` is the fraction of the
+    light that leaves a flat surface, and `v` the mean variance of the layers, weighted by their
+    energies. (This holds for a reflectance of the form `1 / (1 + c kappa)`, with a constant `c`.)
+    The curvature follows from `S_k`, the kernel's mass on the surface divided by its mass on a flat
+    sheet: `H_k = (1 - 1 / S_k) / (depth sqrt(v_k))`, which is exact on spheres that are large
+    against the layer. On a sheet much thinner than the layer is wide `S_k` is 2. A layer too wide
+    for its body uses the greatest mass of the narrower ones.
 
     The gain is 1 on flat surfaces, where S < 1 (open edges, concave parts), and without absorption.
     For non-negative weights with a sum of at most one, no more light leaves than entered, `sum_k
@@ -225,7 +231,7 @@ def resolved_fraction(
     """Compute the fraction of a layer that is the diffusion integral, instead of the surface's own
     irradiance.
 
-    A smooth step of variance over the area of a splat; `interval` is from
+    A smooth step in the variance divided by the area of a splat; `interval` is from
     `AbstractDiffusionKernel.interval`.
     """
     return smooth_step(variance / area, interval[0] ** 2, interval[1] ** 2)
@@ -235,8 +241,8 @@ def resolved_fraction(
 def unevenness(splats: Splats) -> Float[Array, ""]:
     r"""Measure the unevenness of the splats: 0 on a regular grid, about 0.5 at random.
 
-    It is the relative standard deviation, over 64 splats, of the distance to the nearest splat over
-    the root of the area. Splats without area do not count. Not differentiated.
+    It is the relative standard deviation, among 64 splats, of the distance to the nearest splat,
+    divided by the root of the area. Splats without area do not count. Not differentiated.
     """
     if splats.count < 2:
         return jnp.zeros((), splats.centers.dtype)

@@ -56,9 +56,9 @@ def continue_to_points(
 
     **Arguments:**
 
-    - `blended`: from the rows of `continue_from_splats`: means of each channel, perhaps those of
-      the derivative of the source, and mass.
-    - `derivative`: of the same rows; `None` if not requested.
+    - `blended`: the blended rows of `continue_from_splats`: the mean of each channel, the means of
+      the derivative of the source if there are any, and the mass.
+    - `derivative`: the derivative of the same rows; `None` if not requested.
     - `centers`: blended centers of the splats, mm, from the same origin as `points`.
     """
 
@@ -89,12 +89,13 @@ class LayersAtPoints(eqx.Module):
 
     **Attributes:**
 
-    - `variances`: of the layers, mm^2.
-    - `means`, `mass`: of every layer; 0 for layers that no splat resolves.
-    - `irradiance`, `area`, `albedo`: of the surface itself; area per splat in mm^2.
-    - `interval`, `kernel`: of the resolution and normalization of layers.
-    - `derivative`: of means and mass in the logarithm of the variance; `None` if not requested.
-    - `factors`: on the weights of the material; `None` for 1.
+    - `variances`: the variance of each layer, mm^2.
+    - `means`, `mass`: means and mass of every layer; 0 for layers that no splat resolves.
+    - `irradiance`, `area`, `albedo`: attributes of the surface itself; area per splat in mm^2.
+    - `interval`, `kernel`: how layers become resolved, and are normalized.
+    - `derivative`: derivative of means and mass with respect to the logarithm of the variance;
+      `None` if not requested.
+    - `factors`: factors on the weights of the material; `None` for 1.
     """
 
     variances: Float[Array, " gaussians"]
@@ -139,7 +140,7 @@ class LayersAtPoints(eqx.Module):
 
         **Arguments:**
 
-        - `gaussians`: of the layers, as in a plan.
+        - `gaussians`: the Gaussian of each layer, as in a plan.
         - `layers`: means of the channels first, the mass last, 1 if there is none; those beyond the
           channels of `irradiance` are omitted.
         """
@@ -252,8 +253,8 @@ class LayersAtPoints(eqx.Module):
     ) -> tuple[
         Float[Array, "gaussians channels points"], Float[Array, "gaussians channels points"]
     ]:
-        """Differentiate the radiant exitance of every point and channel in the weights of its
-        channel, and in the variances (1/mm^2).
+        """Differentiate the radiant exitance of every point and channel with respect to the weights
+        of its channel, and to the variances (1/mm^2).
 
         **Raises:** `ValueError` without the derivative of the layers.
         """

@@ -43,7 +43,8 @@ class ShapeDiffuser(AbstractDiffuser):
     - `share` is 1/2 where the surface is smooth, and the body's fraction of the solid angle at
       creases: a constant solves the equation of the same splats for `kappa = 0`, without source and
       escape.
-    - `z_e = 0.7104 (1 + 3 C2) / (1 - 2 C1) / sigma_s'`, of the internal reflectance.
+    - `z_e = 0.7104 (1 + 3 C2) / (1 - 2 C1) / sigma_s'`, with the moments of the internal
+      reflectance (`AbstractFresnel`).
     - Q is light scattered once along the beams, each as long as its path through the body. A part
       of it leaves before it diffuses, at either end: the difference of Hopf's function from its
       limit. With absorption another part is absorbed before it diffuses.
@@ -56,9 +57,10 @@ class ShapeDiffuser(AbstractDiffuser):
 
     **Attributes:**
 
-    - `error`: residual of the linear equations over their right side, root mean squares. Static.
-    - `opening`: largest radius of the clusters of far splats, over their distance. The error of
-      exitance is 3e-3 on a sphere, and up to 5e-2 on a slab of four mean free paths, 1e-2 with
+    - `error`: residual of the linear equations divided by their right side, root mean squares.
+      Static.
+    - `opening`: largest radius of the clusters of far splats, divided by their distance. The error
+      of exitance is 3e-3 on a sphere, and up to 5e-2 on a slab of four mean free paths, 1e-2 with
       0.2. With 0 nothing is merged, for reference. Static.
 
     **Source:** Case and Zweifel 1967, "Linear Transport Theory" (Milne problem); Zhu, Pine and
@@ -87,7 +89,7 @@ class ShapeDiffuser(AbstractDiffuser):
 
         **Arguments:**
 
-        - `hierarchy`: from `find_hierarchy`.
+        - `hierarchy`: near splats and clusters, from `find_hierarchy`.
         - `bounced`: irradiance of uniform light that enters beside the beams.
         """
         surface = SurfaceSums.of(splats, hierarchy)
@@ -132,7 +134,7 @@ class ShapeDiffuser(AbstractDiffuser):
 
         **Arguments:**
 
-        - `splats`: in any order; a compact one, as of a plan, is faster.
+        - `splats`: in any order; a compact order, such as that of a plan, is faster.
 
         **Raises:** `ValueError` for splats without area, for open bodies, and for normals that
         point inward.
@@ -188,8 +190,8 @@ class ShapePlan(AbstractDiffusionPlan):
     def material(self, material: Material) -> Material:
         """Return the material, whose surface and coefficients are read.
 
-        **Raises:** `ValueError` for a material without coefficients, or with those of other
-        channels.
+        **Raises:** `ValueError` for a material without coefficients, or whose coefficients have
+        another number of channels.
         """
         if material.medium is None or material.medium.channels != material.channels:
             raise ValueError(
@@ -209,8 +211,8 @@ class ShapePlan(AbstractDiffusionPlan):
         return Diffused(layers, jnp.zeros_like(exitance[0, 0])), solved
 
     def towards(self, eye, splats, material, layers, solved, at):
-        """Replace the radiant exitance of splats by that of a Lambertian surface of their radiance
-        towards the eye.
+        """Replace the radiant exitance of splats by the exitance of a Lambertian surface that has
+        their radiance towards the eye.
         """
         surface = SurfaceSums.of(splats, self.hierarchy)
         seen = take_points(radiance_towards(eye, surface, material, solved), at)

@@ -69,9 +69,9 @@ class StreamedDiffusion:
 
         **Arguments:**
 
-        - `parts`: of one size, with centers from the origin of the points; sources without area do
-          not count.
-        - `channels`: of their irradiance.
+        - `parts`: parts of one size, with centers from the origin of the points; sources without
+          area do not count.
+        - `channels`: number of channels of their irradiance.
         """
 
         def add(sums: Float[Array, "layers values points"], sources: Sources):

@@ -28,12 +28,12 @@ from ._weights import AbstractWeights, FreeWeights
 
 
 class ErrorByCount(eqx.Module):
-    r"""The error (Eq. 4) over the number of Gaussians.
+    r"""The error (Eq. 4) as a function of the number of Gaussians.
 
     **Attributes:**
 
     - `error`: error of the best sums of 1, 2, ... Gaussians.
-    - `variances`: of these sums, mm^2, ascending; the unused last ones are infinite. With
+    - `variances`: variances of these sums, mm^2, ascending; the unused last ones are infinite. With
       `VariancesPerChannel`, for each channel.
     """
 
@@ -129,16 +129,18 @@ class FitResult(eqx.Module):
 
     **Attributes:**
 
-    - `gaussians`: variances ascend. With `VariancesPerChannel`, one of a single channel for each
-      channel, batched.
+    - `gaussians`: the fitted sum, variances ascending. With `VariancesPerChannel` it has a leading
+      axis of channels: variances `[channels, gaussians]`, weights `[channels, gaussians, 1]`.
     - `error`: Eq. 4 of each channel.
-    - `energy_error`: sum of the weights over the profile's total reflectance, minus 1; 0 for a
-      fixed sum.
+    - `energy_error`: sum of the weights divided by the profile's total reflectance, minus 1; 0 for
+      a fixed sum.
     - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
-    - `covariance`: of the variances, and then of the weights of one channel after the other, by
-      Gauss and Newton; with `VariancesPerChannel`, for each channel. Within its ellipsoid Eq. 3 at
-      most doubles. If the residuals are noise of equal size at N independent nodes of Eq. 3, divide
-      it by N less the number of parameters.
+    - `covariance`: how well the profile determines the parameters, in the Gauss-Newton
+      approximation: a change `d` of the parameters with `d @ inv(covariance) @ d <= 1` at most
+      doubles Eq. 3. The parameters are the variances, then the weights of the first channel, of the
+      second, and so on; with `VariancesPerChannel`, there is one matrix for each channel. For error
+      bars of a measured profile with equal, independent noise at `N` radii, divide it by `N` minus
+      the number of parameters.
     """
 
     gaussians: SumOfGaussians
@@ -148,9 +150,9 @@ class FitResult(eqx.Module):
     covariance: Float[Array, "*channels parameters parameters"]
 
     def table(self) -> list[tuple[str, str]]:
-        """Return the Gaussians and their errors as rows of a name and of numbers, a number per
-        channel; the first row is the heading. With `VariancesPerChannel`, the Gaussians of one
-        channel after the other.
+        """Return the Gaussians and their errors as rows: a name, and a number per channel; the
+        first row is the heading. With `VariancesPerChannel`, the Gaussians of one channel after the
+        other.
         """
         weights = self.gaussians.weights.reshape(-1, self.gaussians.channels)
         names = ", ".join(channel_names(len(self.error)))
@@ -183,14 +185,15 @@ def fit_gaussians(
     r"""Fit a sum of Gaussians to a profile: minimize Eq. 3 over variances and weights.
 
     Variable projection: for given variances the best weights are the solution of a linear problem,
-    and Levenberg and Marquardt's method searches the logarithms of the variances. By default a fit
-    with one more Gaussian starts from the previous best fit, with a Gaussian inserted in each gap
-    and at both ends. Compiles once for each count and kind of profile.
+    and Levenberg and Marquardt's method searches the logarithms of the variances. By default the
+    search builds up from one Gaussian: each further one is tried in every gap between the variances
+    of the previous best fit and beyond both ends, and the best result is kept. The fit is compiled
+    once for each count and kind of profile.
 
     The result is differentiable in every parameter of the profile, by the implicit function theorem
     with the full Hessian of Eq. 3, in forward and reverse mode, to first order. The precision
-    follows the profile. In float32 errors below about 1e-5 are rounding, and reaching that floor
-    counts as success.
+    follows the profile. In float32, errors below about 1e-5 are only rounding errors; a search that
+    gets there counts as converged.
 
     **Arguments:**
 
@@ -200,8 +203,8 @@ def fit_gaussians(
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
     - `weights`: `FreeWeights()` (default); `FixedTotalReflectance()`, which keeps the energy; or
       `NonNegativeWeights(...)`, either of these without negative weights.
-    - `start`: `GivenVariances(...)` near those of the best fit, from which one fast search starts;
-      it needs a given count. By default fits with fewer Gaussians give the start.
+    - `start`: `GivenVariances(...)` near the variances of the best fit, from which one fast search
+      starts; it needs a given count. By default fits with fewer Gaussians give the start.
     - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for
       a profile with standard errors.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.
@@ -269,20 +272,20 @@ def fit_weights(
     r"""Fit the weights of Gaussians of given variances to a profile: minimize Eq. 3 over the
     weights.
 
-    It needs no search, and is fast. Variances that ascend by a factor of 3 over all widths of the
-    dipoles of many media give each an error (Eq. 4) of about 0.2%, by a factor of 2 of 0.002%.
-    Layers that are rendered once therefore serve all of these media.
+    It needs no search, and is fast. With variances that increase by a factor of 3 and cover the
+    widths of many media, the dipole of each of these media is fitted with an error (Eq. 4) of about
+    0.2%; with a factor of 2, of 0.002%. One set of rendered layers therefore serves them all.
 
     **Arguments:**
 
     - `profile`: 1/mm^2. Differentiable, in forward and reverse mode.
     - `variances`: mm^2, positive, all different. Constants of every derivative.
-    - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, or `NonNegativeWeights()`
-      among either.
+    - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, or `NonNegativeWeights(...)`,
+      either of these without negative weights.
     - `rule`: radii of the integral, in length scales of the profile.
 
     **Returns:** the Gaussians, in the profile's precision. With the variances of a fit, the weights
-    are those of the fit.
+    equal the weights of the fit.
 
     **Raises:** `ValueError` for a profile that is infinite at the origin unless the rule starts
     beyond it.

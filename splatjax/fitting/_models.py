@@ -40,7 +40,8 @@ class AbstractModel(eqx.Module):
     **Attributes:** (of the class)
 
     - `rule`: the quadrature of a fit to its profiles.
-    - `description`: of its profile, for files; `None` if coefficients alone define it.
+    - `description`: a description of its profile, for files; `None` if coefficients alone define
+      the profile.
     """
 
     rule: ClassVar[AbstractRadialRule] = L2_QUADRATURE
@@ -60,7 +61,7 @@ class DiffusionModel(AbstractModel):
 
     **Attributes:**
 
-    - `kind`: from a medium to a profile that is finite at the origin. Static.
+    - `kind`: computes from a medium a profile that is finite at the origin. Static.
     """
 
     kind: Callable[[Medium], AbstractProfile] = eqx.field(static=True, default=Dipole)
@@ -70,10 +71,16 @@ class DiffusionModel(AbstractModel):
 
 
 class TransportModel(AbstractModel):
-    r"""Light transport: the photon beam with the total reflectance and the angles of a `HalfSpace`.
+    r"""The default model: the photon beam, scaled to the total reflectance of light transport, and
+    with its angles of entry and exit (`HalfSpace`).
 
-    A fit uses radii from half a mean free path on, because splats hardly resolve smaller ones. It
-    weights them by the fifth power of the radius, so that deep shadows are right.
+        model = TransportModel(g=0.8)
+        weights = NonNegativeWeights(FixedTotalReflectance())
+        fitted = fit_gaussians(model.profile(medium), weights=weights, rule=model.rule)
+        material = Material(fitted.gaussians, eta=1.3, angles=model.angles(medium))
+
+    `rule` starts at half a mean free path, because splats hardly resolve smaller radii. It weights
+    radii by their fifth power, so that the fit is right deep in a shadow.
 
     **Attributes:**
 
@@ -99,11 +106,22 @@ class TransportModel(AbstractModel):
 def weight_factors(
     gaussians: SumOfGaussians, other: AbstractProfile
 ) -> Float[Array, "gaussians channels"]:
-    """Fit the factors on the weights of Gaussians that make another profile of them, of its total
-    reflectance: `Splats.weights` where the body is of the other material. Not for traced arrays.
+    """Fit factors that turn the weights of one material into those of another.
 
-    A Gaussian without weight in a channel keeps none: the material with the wider profile should be
-    the first.
+        factors = weight_factors(light.gaussians, dark.gaussians)
+        splats = replace(splats, weights=1 + share[:, None, None] * (factors - 1))
+
+    The variances stay the same, so both materials can be rendered in one picture: `Splats.weights`
+    is 1 where the body consists of the first material, and `factors` where it consists of the
+    second. The second keeps its total reflectance, and no weight becomes negative.
+
+    **Arguments:** concrete arrays, so call it outside of `jit` and `grad`.
+
+    - `gaussians`: the Gaussians of the first material. A weight of 0 stays 0, so take the material
+      with the wider profile.
+    - `other`: the profile of the second material, 1/mm^2.
+
+    **Returns:** one factor for each Gaussian and channel.
     """
     weights = np.asarray(gaussians.weights)
     factors, has_weight = np.ones_like(weights), weights > 0
@@ -127,12 +145,12 @@ class MediumFit(eqx.Module):
 
     **Attributes:**
 
-    - `medium`: the most likely one.
-    - `covariance`: of the logarithms of `sigma_a` and `sigma_s_prime`, per channel: its diagonal
-      has squared relative errors.
-    - `chi_squared`: sum of the squared residuals over their deviations, per degree of freedom:
-      about 1 if the model holds and the deviations are right; above, the error bars are too small
-      by its root.
+    - `medium`: the most likely medium.
+    - `covariance`: covariance of the logarithms of `sigma_a` and `sigma_s_prime`, per channel: its
+      diagonal has squared relative errors.
+    - `chi_squared`: sum of the squares of residuals divided by deviations, per degree of freedom:
+      about 1 if model and deviations are right. If it is larger, multiply the error bars by its
+      square root.
     - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
     """
 
@@ -153,17 +171,17 @@ def fit_medium(
 ) -> MediumFit:
     r"""Fit absorption and scattering to a measured profile: weighted least squares on its samples.
 
-    The model is that of the picture: coefficients, profile, sum of Gaussians, the variance of the
-    beam added to each; it is differentiated as a whole. Channels are independent. Use double
+    The model is the same as for pictures: coefficients, profile, sum of Gaussians, the variance of
+    the beam added to each; it is differentiated as a whole. Channels are independent. Use double
     precision.
 
     **Arguments:**
 
-    - `measured`: with its scale, exitance per unit power entering, 1/mm^2, and with the standard
-      errors of its samples, positive.
+    - `measured`: the profile with its scale, exitance per unit power entering, 1/mm^2, and with the
+      standard errors of its samples, positive.
     - `start`: start of the search, within a factor of about ten; its `eta` is assumed known.
-    - `beam_variance`: of the beam that made the dot, per axis, mm^2.
-    - `model`: from a medium to its profile.
+    - `beam_variance`: variance of the beam that made the dot, per axis, mm^2.
+    - `model`: computes the profile of a medium.
     - `count`: number of Gaussians.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.
 

@@ -37,7 +37,7 @@ def squared_error(
     **Arguments:**
 
     - `profile`: the reference, 1/mm^2. Differentiable.
-    - `gaussians`: with as many channels. Differentiable.
+    - `gaussians`: a sum with as many channels. Differentiable.
     - `rule`: radii of the integral, in length scales of `profile`.
 
     **Returns:** [channels], 1/mm^2, at least 0.
@@ -56,8 +56,8 @@ def squared_error(
 def relative_error(
     profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = L2_QUADRATURE
 ) -> Float[Array, " channels"]:
-    r"""Compute the relative error of a fit: the root of Eq. 3 over that of the integral of `r R^2`
-    (Eq. 4).
+    r"""Compute the relative error of a fit: the root of Eq. 3 divided by the root of the integral
+    of `r R^2` (Eq. 4).
 
     It depends on the core of a profile, and little on its tail: see `FitResult.energy_error` for
     the energy.

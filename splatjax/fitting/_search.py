@@ -68,17 +68,17 @@ class GivenVariances(eqx.Module):
 
 
 class DipoleStarts(eqx.Module):
-    r"""Variances of the best fits to dipoles, per channel, over reduced albedo and index of
-    refraction.
+    r"""A table of the variances of the best fits to dipoles, per channel, by reduced albedo and
+    index of refraction.
 
-    In units of squared mean free paths they depend only on these. They are tabulated over `sqrt(1
-    - alpha')`, in which they are smooth, and interpolated linearly in their logarithms; beyond the
-    table's ends the last entry serves.
+    In units of squared mean free paths the variances depend only on these two. They are tabulated
+    at steps of `sqrt(1 - alpha')`, of which they are smooth functions, and interpolated linearly in
+    their logarithms; beyond the table's ends the last entry serves.
 
     **Attributes:**
 
-    - `roots`: of `1 - alpha'`, equally spaced.
-    - `etas`: equally spaced.
+    - `roots`: values of `sqrt(1 - alpha')`, equally spaced.
+    - `etas`: indices of refraction, equally spaced.
     - `log_variances`: one array per number of Gaussians, from 1 on.
     """
 
@@ -213,7 +213,7 @@ class SharedVariances(AbstractSpread):
     r"""One set of variances for all channels, as the renderer needs: it computes one layer for
     each.
 
-    The fit minimizes the sum over the channels of the square of Eq. 4.
+    The fit minimizes the square of Eq. 4, summed over the channels.
     """
 
     def over(self, function, problem, start):
@@ -221,8 +221,10 @@ class SharedVariances(AbstractSpread):
 
 
 class VariancesPerChannel(AbstractSpread):
-    """Separate variances for each channel: one `SumOfGaussians` of one channel for each, batched
-    along a leading axis.
+    """Separate variances for each channel.
+
+    The result has a leading axis of channels: variances `[channels, gaussians]`, weights
+    `[channels, gaussians, 1]`.
     """
 
     def over(self, function, problem, start):

@@ -30,11 +30,12 @@ class WeightTable(eqx.Module):
 
     **Attributes:** (made by `weight_table`)
 
-    - `names`: of the parameters; `logarithmic`: their scales. Static.
-    - `base`: the Gaussians whose weights are multiplied; those of the scene's material.
+    - `names`: names of the parameters; `logarithmic`: whether the scale of each is logarithmic.
+      Static.
+    - `base`: the Gaussians whose weights are multiplied: the Gaussians of the scene's material.
     - `limits`: the least and the largest value of each parameter.
     - `knots`: the nodes of each parameter, as fractions of its range on its scale.
-    - `slopes`: of the splines at each knot, for a unit at another.
+    - `slopes`: slope of the splines at each knot, for a value of 1 at another knot.
     - `at_nodes`: the factors, row by row of the grid; the last parameter varies fastest.
     """
 
@@ -51,7 +52,7 @@ class WeightTable(eqx.Module):
 
         **Arguments:**
 
-        - `values`: of each parameter by its name, one for each splat or one for all.
+        - `values`: values of each parameter, by name: one for each splat, or one for all.
           Differentiable.
 
         **Raises:** `ValueError` for parameters of other names, and for a value outside of the
@@ -126,7 +127,8 @@ def weight_table(
     nodes: Mapping[str, Numbers],
     base: SumOfGaussians,
 ) -> WeightTable:
-    r"""Tabulate the factors on the weights of a base that make it other materials.
+    r"""Tabulate, for one to three parameters such as melanin and blood, the factors that turn the
+    weights of a base material into those of the material with these parameters.
 
         def skin(melanin, blood):
             return sj.scattering.Skin(melanin, blood, wavelengths=(620, 550, 460)).profile()
@@ -136,7 +138,7 @@ def weight_table(
         splats = replace(splats, weights=table.factors({"melanin": freckles, "blood": 0.01}))
 
     Each node is one fit of weights (`weight_factors`). For the table above, total reflectances
-    between nodes are within 1% of those of the profile, and typically within 0.02%.
+    between nodes are within 1% of the profile's, and typically within 0.02%.
 
     **Arguments:**
 
@@ -144,8 +146,8 @@ def weight_table(
       in double precision.
     - `nodes`: ascending values of one to three parameters, by name. Choose them denser where the
       profile changes faster.
-    - `base`: the Gaussians of the material of the scene. A Gaussian without weight in a channel
-      keeps none: fit it to the widest profile, which is that of the least absorption.
+    - `base`: the Gaussians of the material of the scene. A weight of 0 stays 0, so fit the base to
+      the widest profile, that of the least absorption.
 
     **Returns:** a `WeightTable`, in the precision of the base.
 

@@ -114,7 +114,8 @@ class AbstractWeights(eqx.Module):
           sum.
         - `total`: the energy of the profile.
 
-        **Returns:** the coefficients, and their derivative in `basis^T target`, which is symmetric.
+        **Returns:** the coefficients, and their derivative with respect to `basis^T target`, which
+        is symmetric.
         """
 
     def solve_active(
@@ -141,7 +142,7 @@ class AbstractWeights(eqx.Module):
 
 class FreeWeights(AbstractWeights):
     """Any weights, for the least error of Eq. 3. Their sum may differ from the profile's total
-    reflectance by some per cent.
+    reflectance by a few per cent.
     """
 
     def solve(self, basis, target, energies, total):
@@ -176,8 +177,8 @@ class NonNegativeWeights(AbstractWeights):
 
     - `among`: `FreeWeights()` (default) or `FixedTotalReflectance()`.
 
-    **Source:** the conditions are those of Kuhn and Tucker; one index at a time is exchanged, the
-    last first (Murty 1974), which ends for every positive definite problem.
+    **Source:** the conditions of Kuhn and Tucker; one index at a time is exchanged, the last first
+    (Murty 1974), which ends for every positive definite problem.
     """
 
     among: AbstractWeights = FreeWeights()

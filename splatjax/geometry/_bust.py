@@ -50,11 +50,11 @@ def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
     **Arguments:**
 
     - `count`: number of splats, at least 1.
-    - `seed`: of the random positions; the same seed gives the same splats.
+    - `seed`: seed of the random positions; the same seed gives the same splats.
 
     **Returns:** splats with albedo, specular and roughness, mm, in JAX's default precision and in
-    Morton order. Their areas add up to that of the mesh. `splatjax.geometry.sample_mesh` describes
-    their distribution.
+    Morton order. Their areas add up to the area of the mesh. `splatjax.geometry.sample_mesh`
+    describes their distribution.
 
     **Raises:** `ValueError` when `count` is below 1.
     """

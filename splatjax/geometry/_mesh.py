@@ -21,7 +21,7 @@ class Mesh(eqx.Module):
     - `normals`: unit, outward, one per vertex.
     - `uvs`: per face and corner; u to the right and v *up*, so that (0, 0) is the lower left corner
       of a texture and (0, 1) the upper left, where its row 0 begins. `None` where there are none.
-    - `colors`: of vertices, linear, in [0, 1]. `None` where there are none.
+    - `colors`: colors of the vertices, linear, in [0, 1]. `None` where there are none.
     - `parts`: number of the part that each face belongs to, where parts have textures of their own.
     """
 
@@ -54,8 +54,8 @@ class Mesh(eqx.Module):
 def vertex_normals(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Compute unit vertex normals as the area-weighted mean of those of the faces around; +y for a
-    vertex without faces.
+    """Compute unit vertex normals as the area-weighted mean of the normals of the faces around; +y
+    for a vertex without faces.
     """
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     face_normals = np.cross(b - a, c - a)
@@ -64,7 +64,7 @@ def vertex_normals(
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Scale vectors to length one; +y for those of length zero."""
+    """Scale vectors to length one; a vector of length zero becomes +y."""
     x, y, z = np.moveaxis(vectors, -1, 0)  # sums over an axis of three are slow
     length = np.sqrt(x * x + y * y + z * z)[..., None]
     up = np.asarray([0.0, 1.0, 0.0], vectors.dtype)
@@ -120,9 +120,9 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
     """Estimate missing normals of a mesh, and replace inconsistent ones, so that edges are hard
     where triangles differ by more than an angle.
 
-    Around each vertex, triangles that are joined by soft edges share a normal, the mean of theirs
-    weighted by their angles there. A vertex keeps its normal if that is within the given angle of
-    all its triangles.
+    Around each vertex, triangles that are joined by soft edges share a normal, the mean of their
+    normals weighted by their angles at the vertex. A vertex keeps its normal if it is within the
+    given angle of all its triangles.
 
     **Arguments:**
 

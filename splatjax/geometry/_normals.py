@@ -23,15 +23,16 @@ def estimate_normals(
     r"""Estimate outward unit normals of points on a surface.
 
     A plane is fitted to the nearest points of each point (principal components, weighted by
-    distance). The normal of a point is the mean of those of its own and its neighbors' planes, each
-    weighted by its fit to its own points and to this point. At an edge the planes of one side
-    dominate, near a second sheet those of the point's own sheet, and noise is averaged over many
-    planes. Points that are visible from outside face the viewer; hidden ones follow their
-    neighbors, and a surface open to both sides faces away from its middle at the farthest point.
+    distance). The normal of a point is the mean of the normals of its own plane and of its
+    neighbors' planes, each weighted by how well the plane fits its own points and this point. At an
+    edge the planes of one side dominate, near a second sheet the planes of the point's own sheet,
+    and noise is averaged over many planes. Points that are visible from outside face the viewer;
+    hidden ones follow their neighbors, and a surface open to both sides faces away from its middle
+    at the farthest point.
 
     **Arguments:**
 
-    - `points`: mm, at least 4 at different places. Those at one place have one normal.
+    - `points`: mm, at least 4 at different places. Points at one place have one normal.
     - `neighbors`: number of neighbors in the mean.
 
     **Source:** Hoppe et al. 1992, "Surface Reconstruction from Unorganized Points", sections 3.2

@@ -25,8 +25,8 @@ class Textures(eqx.Module):
     - `roughness`: factor on the material's roughness.
     - `normal`: tangent-space normals in [-1, 1]: x along u, y along v (*up*), z outward; of any
       positive length.
-    - `share`: how much of the surface is of another material, from 0 to 1, whose weights are
-      `factors` times those of the material.
+    - `share`: the fraction of the surface that consists of a second material, from 0 to 1, whose
+      weights are `factors` times those of the first.
     """
 
     albedo: (
@@ -125,16 +125,16 @@ def sample_mesh(
     **Arguments:**
 
     - `mesh`: mm, with positive area.
-    - `count`: of splats, at least 1.
+    - `count`: number of splats, at least 1.
     - `textures`: looked up bilinearly at every splat.
     - `seed`: another spread of the same quality; the same seed gives the same splats.
     - `rounded`: place splats on a curved surface that follows the mesh's normals, instead of on
       flat triangles.
 
-    **Returns:** splats in Morton order, in JAX's default precision. Their areas are those of their
-    Voronoi cells on the surface, all scaled by one factor so that they add up to the surface's
-    area; their radii are `1.5 sqrt(area)`, and at least 1.2 times the distance of the farthest
-    corner of the cell, so that the discs leave no hole.
+    **Returns:** splats in Morton order, in JAX's default precision. Their areas are the areas of
+    their Voronoi cells on the surface, all scaled by one factor so that they add up to the
+    surface's area; their radii are `1.5 sqrt(area)`, and at least 1.2 times the distance of the
+    farthest corner of the cell, so that the discs leave no hole.
 
     **Raises:** `ValueError` for a count below 1, a mesh without area, or textures on a mesh without
     UVs.
@@ -208,9 +208,9 @@ def complete_splats(
     **Arguments:**
 
     - `centers`: mm, at least one.
-    - `normals`: unit; `None`: from neighbors (`estimate_normals`).
-    - `areas`: mm^2; `None`: those of the Voronoi cells in the tangent planes.
-    - `radii`: mm; `None`: as large as the cells require, so that no hole is left.
+    - `normals`: unit; `None` to estimate them from neighbors (`estimate_normals`).
+    - `areas`: mm^2; `None` for the areas of the Voronoi cells in the tangent planes.
+    - `radii`: mm; `None` for radii as large as the cells require, so that no hole is left.
     - `albedo`, `specular`, `roughness`, `weights`: as in `Splats`; never estimated.
 
     Isolated points are kept with the size of their neighbors, and a warning reports their number.

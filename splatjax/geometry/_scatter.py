@@ -124,7 +124,7 @@ class SurfacePoints(NamedTuple):
         return np.einsum("nc,nci->ni", self.barycentrics, mesh.vertices[mesh.faces[self.faces]])
 
     def normals(self, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-        """Compute unit normals, interpolated between those of the vertices."""
+        """Compute unit normals, interpolated between the normals of the vertices."""
         return unit(
             np.einsum("nc,nci->ni", self.barycentrics, mesh.normals[mesh.faces[self.faces]])
         )

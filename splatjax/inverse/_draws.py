@@ -28,19 +28,19 @@ def randomized_fits(
         draws = sj.inverse.randomized_fits(fit, observations, fitted, 16)
         bars = np.std([draw.maps["melanin"] for draw in draws], axis=0, ddof=1)
 
-    Each fit starts from the best step of the given one. Noise of their deviations is added to the
-    pictures, and the priors expect random coordinates in place of those of the start. For a linear
-    picture and converged fits, the results are then draws from the posterior. Their spread
-    describes noise and prior, and neither errors of the model nor ambiguities far away. A splat
-    that no picture shows has the spread of the prior. Nothing is compiled again.
+    Each fit starts from the best step of the given fit. Noise with the deviation of each picture is
+    added to it, and the mean of each prior is drawn at random, too. For a linear picture and
+    converged fits, the results are then draws from the posterior. Their spread describes noise and
+    priors, but neither errors of the model nor other solutions far away. A splat that no picture
+    shows has the spread of the prior. Nothing is compiled again.
 
     **Arguments:**
 
     - `fit`: calls `fit_scene` with observations and `start=`.
-    - `observations`: those of the fit.
+    - `observations`: the observations of the fit.
     - `fitted`: the converged fit.
-    - `count`: of the draws. The relative error of a bar is `1 / sqrt(2 (count - 1))`.
-    - `seed`: of the noise.
+    - `count`: number of draws. The relative error of a bar is `1 / sqrt(2 (count - 1))`.
+    - `seed`: seed of the noise.
 
     **Returns:** the fits.
 

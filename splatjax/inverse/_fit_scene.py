@@ -106,17 +106,18 @@ class FittedScene(eqx.Module):
     **Attributes:**
 
     - `splats`: the body.
-    - `cameras`, `lights`: of each picture.
-    - `material`: the given one.
-    - `maps`: of `ParameterMap`: the values of each parameter, by name.
+    - `cameras`, `lights`: the camera and the lights of each picture.
+    - `material`: the given material.
+    - `maps`: the values of each parameter of a `ParameterMap`, by name.
     - `losses`: at the start and after each step: the sum of the losses of all pixels and of the
-      priors, over the number of values that count. About 1 if the residual is noise.
+      priors, divided by the number of values that count. About 1 if the residual is noise.
     - `best`: the step with the least loss, to which the other fields belong. Static.
-    - `plans`: number of plans, including that of the start. Static.
+    - `plans`: number of plans, including the first. Static.
     - `pictures`: rendered; NaN where a pixel does not count.
-    - `residuals`: rendered less observed pictures.
+    - `residuals`: rendered minus observed pictures.
     - `result`: the outcome, as a message (`optimistix.RESULTS`).
-    - `coordinates`: of the parts; `state`: of the fit, from which it continues (`start`).
+    - `coordinates`: coordinates of the parts; `state`: state of the fit, from which another fit
+      continues (`start`).
     """
 
     splats: Splats
@@ -157,15 +158,21 @@ def fit_scene(
     progress: Callable[[str, float], None] | None = None,
     throw: bool = True,
 ) -> FittedScene:
-    r"""Fit parts of a scene to observed pictures, along the gradient of the rendered ones.
+    r"""Fit parts of a scene to observed pictures, along the gradient of the rendered pictures.
+
+        seen = Observation(picture, camera, lights, deviation=noise)
+        optimizer = optax.adam(optax.cosine_decay_schedule(2.0, 60), b2=0.9)
+        fitted = fit_scene([seen], splats, material, [AlbedoMap()], optimizer, steps=60)
+        fitted.splats.albedo, fitted.losses
 
     Each part has unbounded coordinates in units of its step. The optimizer works on these, so that
     one learning rate serves all parts. The fit minimizes
 
         sum_pixels loss((rendered - observed) / deviation) + sum_coordinates (moved / expected)^2
 
-    over the number of values of pixels, the second sum over parts with a prior. Nothing is compiled
-    between steps. If the scene exceeds the capacity of its plan, a new plan is made.
+    divided by the number of pixel values that count. The second sum runs over the parts that have a
+    prior. Nothing is compiled between steps. If the scene exceeds the capacity of its plan, a new
+    plan is made.
 
     **Arguments:**
 
@@ -173,19 +180,20 @@ def fit_scene(
       their cameras and lights, which are otherwise assumed right. Without a deviation, the noise is
       1% of the root mean square of the picture.
     - `splats`: the body, mm; `AlbedoMap` and `NormalOffsets` start from it.
-    - `material`: known, with the Gaussians of a `ParameterMap`. `recover` finds coefficients.
+    - `material`: the known material; for a `ParameterMap`, with the Gaussians of its table.
+      `recover` finds coefficients.
     - `parts`: the parts that may change, each kind once.
-    - `optimizer`: any of optax whose update needs only gradients. Its rate is in steps:
-      `optax.adam(1.0)` first moves each coordinate by one step at a time. With a rate that decays
-      to zero, such as `optax.cosine_decay_schedule(1.0, steps)`, the fit converges.
-    - `steps`: their number.
+    - `optimizer`: any optimizer of optax whose update needs only gradients. Its learning rate is in
+      steps: `optax.adam(1.0)` first moves each coordinate by one step at a time. With a rate that
+      decays to zero, such as `optax.cosine_decay_schedule(1.0, steps)`, the fit converges.
+    - `steps`: number of steps.
     - `loss`: `SquaredLoss()`, or `HuberLoss()` where the model does not explain some pixels.
     - `background`: with `UnknownBackground()` only pixels that the body fills count. With
       `BlackBackground()` all unmasked pixels count, which determines cameras and outlines much
       better.
-    - `settings`: of the renderer.
-    - `start`: a fit to continue, by `steps` more. If all other arguments are equal, the result is
-      that of one fit with all steps, bit for bit.
+    - `settings`: settings of the renderer.
+    - `start`: a fit to continue, by `steps` more. If all other arguments are equal, the result
+      equals that of one fit with all steps, bit for bit.
     - `progress`: called with a description of each stage, and the loss.
     - `throw`: raise when a loss or gradient is not finite; otherwise `result` reports it, and the
       best scene so far is returned.

@@ -33,8 +33,8 @@ class AbstractIntensity(eqx.Module):
 
     @abc.abstractmethod
     def groups(self, channels: int) -> np.ndarray:
-        """Return for each channel the index of its factor among those of the picture; -1 if it is
-        known to be 1.
+        """Return for each channel the index of its factor among the factors of the picture; -1 if
+        it is known to be 1.
         """
 
 
@@ -70,8 +70,8 @@ class Observation(eqx.Module):
     **Attributes:**
 
     - `picture`: radiance, like `Frame.beauty`; NaN where a pixel is unknown.
-    - `camera`: with as many pixels.
-    - `lights`: all of them.
+    - `camera`: a camera with as many pixels.
+    - `lights`: all lights of the picture.
     - `mask`: the pixels that count; `None` for all. Pixels that the body does not fill never count,
       because the background is unknown.
     - `deviation`: standard deviation of the noise, for each pixel and channel or one number.
@@ -121,9 +121,9 @@ def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> lis
 
     **Arguments:**
 
-    - `splats`: of the body, mm.
-    - `camera`: of all pictures.
-    - `channels`: of the pictures.
+    - `splats`: the splats of the body, mm.
+    - `camera`: the camera of all pictures.
+    - `channels`: number of channels of the pictures.
     """
     right, down, forward = np.asarray(camera.rotation, float)
     directions = {
@@ -177,14 +177,14 @@ class SquaredLoss(AbstractLoss):
 
 @record
 class HuberLoss(AbstractLoss):
-    r"""The square for small residuals and twice the absolute value times the bend for large ones,
-    smoothly.
+    r"""Squared loss for small residuals, and linear, `2 bend |r|`, for large ones, with a smooth
+    transition.
 
         loss(r) = 2 b^2 (sqrt(1 + r^2 / b^2) - 1)
 
     **Attributes:**
 
-    - `bend`: deviations at which one becomes the other, positive. Static.
+    - `bend`: residual, in deviations, at which one becomes the other; positive. Static.
 
     **Raises:** `ValueError` for a bend that is not positive.
 

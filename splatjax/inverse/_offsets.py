@@ -68,21 +68,24 @@ class OffsetTables(eqx.Module):
 
 
 class NormalOffsets(AbstractPart):
-    r"""The offset of each splat along its initial normal: a displacement map, no finer than
-    `smoothness`.
+    r"""A displacement map: the offset of each splat along its initial normal.
+
+        part = NormalOffsets(step=0.02, smoothness=0.9, deviation=0.4)  # mm
+
+    Independent offsets of neighboring splats would produce noise and holes, so the coordinates `x`
+    are blurred over the surface:
 
         offset = step blur(x),   center = start + offset normal
 
-    The blur is a Gaussian mean over the surface, so an offset changes by no more than its
-    coordinates do. Normals, areas and radii follow from the slopes of the offsets among the
-    neighbors of each splat. A splat farther than 2.5 `smoothness` from all visible ones does not
-    move.
+    The blur is a mean over the surface with Gaussian weights, so no offset exceeds `step` times the
+    largest coordinate nearby. Normals, areas and radii follow the displaced surface. A splat
+    farther than 2.5 `smoothness` from all visible ones does not move.
 
     **Attributes:** (static)
 
-    - `step`: mm.
-    - `smoothness`: standard deviation of the blur, mm; some spacings of the splats. Finer bumps
-      are not searched.
+    - `step`: offset by a coordinate of 1, mm.
+    - `smoothness`: standard deviation of the blur, mm; choose a few spacings of the splats. Finer
+      bumps are not found.
     - `deviation`: expected size of an offset, one standard deviation of a normal prior, mm.
     """
 

@@ -38,12 +38,12 @@ class ParameterMap(AbstractPart):
 
         fraction = 1 / (1 + exp(-(logit(start) + blur(B x))))
 
-    The fraction is that of the range of a parameter, on its scale. The blur is a Gaussian mean over
-    the surface. `B` is the inverse root of `J^T J / step^2 + 1 / deviation^2`, where `J` has the
-    derivatives of the reflectance of a flat surface at the start, relative to its mean over the
-    channels. One coordinate therefore changes the color by about one step, in directions that are
-    independent where parameters have similar effects. A splat farther than 2.5 `smoothness` from
-    all visible ones keeps its start.
+    The fraction is the place of a value in the range of its parameter, on the parameter's scale.
+    The blur is a Gaussian mean over the surface. `B` is the inverse root of `J^T J / step^2 + 1 /
+    deviation^2`, where `J` has the derivatives of the reflectance of a flat surface at the start
+    with respect to the logits, relative to its mean over the channels. One coordinate therefore
+    changes the color by about one step, in directions that are independent where parameters have
+    similar effects. A splat farther than 2.5 `smoothness` from all visible ones keeps its start.
 
     The part replaces `Splats.weights`. An albedo of the same splats must be known.
 
@@ -51,8 +51,8 @@ class ParameterMap(AbstractPart):
 
     - `table`: the factors of the parameters, on the Gaussians of the material.
     - `start`: values of each parameter by its name, one for each splat or one for all.
-    - `smoothness`: standard deviation of the blur, mm. Static. Wider than half the spacing of the
-      splats it makes maps smoother, and fits slower.
+    - `smoothness`: standard deviation of the blur, mm. Static. If it is wider than half the spacing
+      of the splats, maps become smoother, and fits slower.
     - `deviation`: expected distance of a logit from its start, one standard deviation of a normal
       prior; 2 covers nearly the whole range. Static.
     - `step`: change of the color by a coordinate, relative. Static.
@@ -126,7 +126,7 @@ def _changes(x: Float[Array, "splats parameters"], prepared: MapTables):
 def _reflectance_slopes(
     table: WeightTable, logits: Float[Array, "splats parameters"]
 ) -> Float[Array, "splats channels parameters"]:
-    """Differentiate the reflectance over its mean in the logits."""
+    """Differentiate the reflectance with respect to the logits, and divide by its mean."""
 
     def reflectance(logits):
         return table.reflectance(jax.nn.sigmoid(logits)[None])[0]

@@ -73,7 +73,7 @@ class AlbedoMap(AbstractPart):
 
     **Attributes:** (static)
 
-    - `step`: of the logit: 0.1 moves an albedo of 0.5 by 0.025.
+    - `step`: a step of the logit: 0.1 moves an albedo of 0.5 by 0.025.
     - `deviation`: expected distance of a logit from its start, one standard deviation of a normal
       prior. An invisible splat keeps its albedo; a hardly visible one nearly keeps it.
 
@@ -107,7 +107,7 @@ class LightStrengths(AbstractPart):
 
     **Attributes:** (static)
 
-    - `step`: of the logarithm: 0.05 is 5%.
+    - `step`: a step of the logarithm: 0.05 is 5%.
     """
 
     step: float = eqx.field(static=True, default=0.05)

@@ -71,42 +71,50 @@ def recover(
     settings: RenderSettings = _FINE,
     progress: Callable[[str, Medium], None] | None = None,
 ) -> Recovery:
-    r"""Fit absorption and scattering to pictures of a known shape: weighted least squares on all
-    pixels at once.
+    r"""Find the absorption and reduced scattering of a material from pictures of a known shape.
 
-    The search differentiates the whole graph: coefficients, profile, Gaussians, layers, picture.
-    The layers, which are expensive, depend only on the variances of the Gaussians. They are
-    rendered once for many steps of the Levenberg-Marquardt method; nothing is compiled between
-    steps or starts. At first the variances are fixed: those of `wide_variances` serve all
-    coefficients within a factor of three of the starts. In each following round they are those of
-    the fit to the coefficients, and layers change along their slopes with the fit, until a round
-    changes nothing. The angles of the light are those of the coefficients at the start of the
-    round. The final picture is the one that `render` makes of `Recovery.material`, with the
-    derivatives of `picture_jacobian`.
+        seen = Observation(picture, camera, lights, deviation=noise)
+        recovery = recover([seen], splats, load_medium("skin1"))
+        print(recovery.summary())  # coefficients, error bars, and what is not determined
+
+    Give a start within a factor of three of both coefficients, or several starts. The error bars
+    assume that shape, lights, camera and model are right; compare `recovery.chi_squared` with 1.
+
+    The search is weighted least squares on all pixels at once, and differentiates the whole graph:
+    coefficients, profile, Gaussians, layers, picture. The layers, which are expensive, depend only
+    on the variances of the Gaussians. They are rendered once for many steps of the
+    Levenberg-Marquardt method; nothing is compiled between steps or starts.
+
+    The first search uses fixed variances (`wide_variances`), which serve all coefficients within a
+    factor of three of the starts. Each further round fits `count` Gaussians to the coefficients
+    found so far, renders their layers and the derivatives of the layers with respect to the
+    variances, and searches again, until a round changes nothing. The angles of the light are
+    updated once a round. The final picture is the one that `render` makes of `Recovery.material`,
+    with the derivatives of `picture_jacobian`.
 
     **Arguments:**
 
     - `observations`: one or more.
-    - `splats`: of the body, mm. Its albedo is assumed known; without one the coefficients alone
-      give the color.
+    - `splats`: the splats of the body, mm. Their albedo is assumed known; without albedo the
+      coefficients alone give the color.
     - `starts`: starts of the search; their `eta` is assumed known and must be the same. Of several,
-      the best end is kept.
-    - `surface`: its specular strength and roughness are known, and its index, which is that of the
+      the search with the least loss counts.
+    - `surface`: a material of known specular strength and roughness, and of the same index as the
       starts; its Gaussians are not used. By default there is no specular lobe.
     - `model`: `TransportModel()`, by default, or `DiffusionModel()`, the classical dipole.
     - `count`: number of Gaussians.
     - `weights`: the constraint of the weights; by default non-negative and with a fixed sum, as in
       the materials of the library.
     - `loss`: `SquaredLoss()`, or `HuberLoss()` where the model does not explain some pixels.
-    - `settings`: of the renderer. By default its layers are eight times finer than those of
-      `render`: for bright materials, an error of 0.1% of a picture is an error of 2% of the
+    - `settings`: settings of the renderer. By default the layers are eight times more accurate than
+      in `render`: for bright materials, an error of 0.1% of a picture is an error of 2% of the
       absorption.
     - `progress`: called with a description of each stage, and the best medium so far.
 
     **Returns:** a `Recovery` in JAX's default precision: `jax.enable_x64` resolves small errors,
-    and does not change the pictures. If the rounds have not converged it is that of the round with
-    the least loss, with its error bars, and `result` and a `RuntimeWarning` report it. To continue,
-    start from its `medium`.
+    and does not change the pictures. If the rounds have not converged, it is the recovery of the
+    round with the least loss, with its error bars, and `result` and a `RuntimeWarning` report it.
+    To continue, start from its `medium`.
 
     **Raises:** `ValueError` for no observation or start, for channels that disagree, for starts
     without absorption, for different indices of surface and starts, and for a picture without a
@@ -246,7 +254,8 @@ class Prediction(eqx.Module):
     **Attributes:**
 
     - `candidate`: the picture.
-    - `covariance`: of the logarithms of `sigma_a` and `sigma_s_prime` of each channel, with it.
+    - `covariance`: covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each channel,
+      with this picture.
     """
 
     candidate: Candidate
@@ -278,13 +287,13 @@ def next_pictures(
 
     **Arguments:**
 
-    - `recovery`: from the earlier pictures, with its model and weights.
-    - `splats`: of the body.
+    - `recovery`: the recovery from the earlier pictures; its model and weights are used.
+    - `splats`: the splats of the body.
     - `candidates`: at least one; see `default_candidates`.
-    - `settings`: of the renderer. By default those of `render`: a prediction needs less fine layers
-      than a search.
+    - `settings`: settings of the renderer, by default the same as for `render`: a prediction needs
+      less accurate layers than a search.
 
-    **Returns:** predictions; first the one with the least error of its worst combination.
+    **Returns:** the predictions, sorted by the error of their worst combination, the least first.
 
     **Raises:** `ValueError` for no candidate, and for one in which the body is not visible.
     """

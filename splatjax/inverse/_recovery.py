@@ -160,22 +160,24 @@ class Recovery(AbstractEstimate):
     - `medium`: its coefficients, 1/mm.
     - `material`: its Gaussians, with the known surface.
     - `intensities`: factors on the light of each picture; 1 where the light was known.
-    - `information`: inverse of the covariance that the given noise leaves: of the logarithms of
-      `sigma_a`, channel by channel, of those of `sigma_s_prime`, of the unknown factors, and,
-      channel by channel, of the width below which the splats do not resolve a layer.
+    - `information`: inverse of the covariance that the given noise leaves. The unknowns are the
+      logarithms of `sigma_a`, channel by channel, of `sigma_s_prime`, of the unknown factors on the
+      light, and, channel by channel, of the width below which the splats do not resolve a layer.
     - `unresolved`: the fraction of the light of each channel that spreads less than the spacing of
-      the splats. A picture determines its amount, not its distance.
-    - `chi_squared`: squared residuals over the noise, per degree of freedom. About 1 if model and
-      noise are right; far above, the model is incomplete, and error bars are too small.
+      the splats. A picture determines how much light this is, not how far it travels.
+    - `chi_squared`: sum of the squares of residuals divided by the noise, per degree of freedom.
+      About 1 if model and noise are right; far above, the model is incomplete, and error bars are
+      too small.
     - `noise_is_known`: whether all pictures have deviations; if not, error bars follow from the
       residuals. Static.
-    - `relative_noise`: deviation of a typical pixel over the brightness of its picture. Static.
+    - `relative_noise`: deviation of a typical pixel divided by the brightness of its picture.
+      Static.
     - `pictures`: rendered with the coefficients; NaN where a pixel does not count.
-    - `residuals`: rendered less observed pictures.
+    - `residuals`: rendered minus observed pictures.
     - `ends`, `costs`: the end of the search from each start in the first round, and the sum of its
       losses.
-    - `steps`, `rounds`: of all searches. Static.
-    - `model`, `weights`: with which the pictures were explained.
+    - `steps`, `rounds`: number of steps of all searches, and of rounds. Static.
+    - `model`, `weights`: the model, and the constraint of the weights, that explain the pictures.
     - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
 
     Error bars assume that model and shape are right and that the noise of pixels is independent:
@@ -215,8 +217,9 @@ class Recovery(AbstractEstimate):
         """Compute the covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each
         channel, marginalized over the other unknowns.
 
-        It is the sum of that of the noise, and of the squared error of the search for an error of
-        the transition to unresolved layers by its deviation.
+        It has two parts: the covariance due to noise, and the square of the change of the
+        coefficients if the width below which layers are unresolved is off by one standard deviation
+        (`resolution`).
 
         **Arguments:**
 
@@ -273,7 +276,7 @@ def combined(recoveries: Sequence[Recovery]) -> Estimate:
     information.
 
     A search of all pictures at once weights their pixels by noise alone. Many pixels with
-    unresolved layers, which do not determine the distance of light, then outweigh a few that do. In
+    unresolved layers, which do not show how far light travels, then outweigh the few that do. In
     separate searches, the error bars of each picture give the combination of coefficients that it
     determines, and only that is used: a coarse picture of a body for the reflectance, a close one
     under a laser dot for the distance.

@@ -85,7 +85,7 @@ def load_camera(path: StrPath, name: str = "0", *, mm_per_unit: float, up: str =
 
 
 def resized(camera: Camera, height: int) -> Camera:
-    """Return a camera of another number of rows, and of as many columns as it then needs."""
+    """Return a camera with another number of rows, and as many columns as they require."""
     width = round(camera.width * height / camera.height)
     return replace(camera, width=width, height=height)
 

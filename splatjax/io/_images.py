@@ -119,8 +119,8 @@ def write_png(
     - `picture`: a frame, whose beauty over black is written; or linear values of 1 (gray), 3 (RGB)
       or 4 channels (RGB premultiplied by alpha, and alpha; written without premultiplication, as
       PNG requires).
-    - `exposure`: in stops: the values are multiplied by `2^exposure` before they are encoded.
-      Values above 1 are clipped.
+    - `exposure`: exposure in stops: the values are multiplied by `2^exposure` before they are
+      encoded. Values above 1 are clipped.
 
     **Raises:** `ValueError` for another suffix than `.png`, another number of channels, or an
     exposure that is not finite, `FileNotFoundError` when the folder does not exist.
@@ -213,11 +213,11 @@ def write_exr(
 
     **Arguments:**
 
-    - `variances`: of the Gaussians, mm^2, written to the header.
+    - `variances`: variances of the Gaussians, mm^2, written to the header.
     - `manifest`: settings of the picture, written to the header as JSON (`read_manifest`).
-    - `camera`: of the picture, written as `worldToCamera` (right, up and forward, mm) and
-      `worldToNDC` (column and row over the size of the picture), which `load_cameras` reads. Both
-      are of row vectors: `[x y z 1] M`, divided by the last entry.
+    - `camera`: the camera of the picture, written as `worldToCamera` (right, up and forward, mm)
+      and `worldToNDC` (column and row divided by the size of the picture), which `load_cameras`
+      reads. Both multiply row vectors: `[x y z 1] M`, divided by the last entry.
     - `half`: write half precision, except for depth and position.
 
     **Raises:** `ValueError` for another suffix than `.exr`, `FileNotFoundError` when the folder

@@ -59,7 +59,7 @@ def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
     format of floating-point numbers. Maps of more than 512 rows are halved, by averaging, while
     both sides are even, with little effect on samples and highlights.
 
-    **Arguments:** `fields`: the others of `EnvironmentLight`, by name.
+    **Arguments:** `fields`: the other fields of `EnvironmentLight`, by name.
 
     **Raises:** as `read_picture` does, and `ValueError` for a map that is not twice as wide as
     high, or has radiance that is negative or not finite.
@@ -76,9 +76,9 @@ def load_lights(
 ) -> list[AbstractLight]:
     r"""Read the punctual lights of a glTF or GLB file (KHR_lights_punctual).
 
-    A surface that faces a directional light of 1 lux receives the irradiance `lux`, and so does
-    one that is 1 unit of length from a point or spot light of 1 candela: with `lux` 1, pictures
-    are in candela per square meter.
+    A surface that faces a directional light of 1 lux receives the irradiance `lux`. A surface that
+    is 1 unit of length from a point or spot light of 1 candela receives the same. With `lux` 1,
+    pictures are in candela per square meter.
 
     **Arguments:**
 
@@ -112,7 +112,7 @@ def read_observations(path: StrPath) -> list[Observation]:
         [[pictures]]
         file = "left.exr"           # linear light: R, G and B, or Y; beside this file
         mask = "left_mask.exr"      # optional: pixels that are 0 do not count
-        noise = 0.01                # optional: standard deviation over the root mean square
+        noise = 0.01                # optional: standard deviation / root mean square
         intensity = "known"         # or "unknown": one factor on its light is found;
                                     # or "unknown color": one for each channel
         camera = { position = [0, 0, 500], target = [0, 0, 0], fov = 25 }  # mm, degrees (vertical)

@@ -61,7 +61,7 @@ def list_materials() -> tuple[str, ...]:
 
 
 def material_path(name_or_path: StrPath) -> Path:
-    """Return the file of an argument of `load_material`: that of a name, or the path itself.
+    """Return the file of an argument of `load_material`: the file of a name, or the path itself.
 
     **Raises:** `ValueError` for an unknown name.
     """
@@ -193,7 +193,7 @@ def save_material(
     **Arguments:**
 
     - `material`: one material (no batch); written with enough digits to be restored exactly.
-    - `path`: of the file; its folder must exist.
+    - `path`: path of the file; its folder must exist.
     - `profile`: the profile to which the Gaussians were fitted. Its coefficients are written in
       place of the material's `medium`, and its kind into [fit].
     - `source`: source of the numbers: `citation`, `provenance`, ...

@@ -18,13 +18,13 @@ _SURFACE, _MATERIAL = "openpbr", "material"
 def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.0) -> None:
     r"""Write a material as a MaterialX document with an OpenPBR surface, completely or not at all.
 
-    The color and the mean free path of the subsurface are those of the material's coefficients
-    (`splatjax.exports.openpbr_subsurface`). `specular_roughness` is the root of the
-    material's. The Gaussians are not stored.
+    The color and the mean free path of the subsurface follow from the material's coefficients
+    (`splatjax.exports.openpbr_subsurface`). `specular_roughness` is the root of the material's
+    roughness. The Gaussians are not stored.
 
     **Arguments:**
 
-    - `material`: of one or three channels, with a `Medium`.
+    - `material`: a material of one or three channels, with a `Medium`.
     - `mm_per_unit`: length of the unit of the other renderer's scene, mm.
 
     **Raises:** `ValueError` for a material without coefficients, or of another number of channels;

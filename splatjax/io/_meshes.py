@@ -79,14 +79,13 @@ def sample_mesh(
     - `share`, `factors`: gray picture, not decoded: the fraction of the surface that consists of a
       second material, whose weights are `factors` times those of the first
       (`splatjax.fitting.weight_factors`).
-    - `v_up`: whether v = 0 is the *lower* edge of a map. `None` uses the rule of the format: yes
-      for all except glTF and GLB. Wrongly converted files need `True`: otherwise the texture is
-      upside down.
+    - `v_up`: set it to `True` if the texture appears upside down. It means that v = 0 is the
+      *lower* edge of a map; `None` follows the format: the lower edge for all except glTF and GLB.
     - `up`: the file's upward axis, `"y"` or `"z"`; splats have +y up.
     - `crop_min_y`: the mesh below this height, in the file's unit, is removed.
     - `crease_angle`: degrees from 0 to 180. Edges between triangles that differ by more are hard,
       if the file has no normals, or normals that differ by more than this from their triangles.
-    - `seed`: of the random positions.
+    - `seed`: seed of the random positions.
     - `rounded`: place splats on a curved surface that follows the mesh's normals, instead of on its
       flat triangles, which make the edge between light and shadow ragged. Hard edges stay straight.
 
@@ -127,7 +126,7 @@ def read_textured_mesh(
     crop_min_y: float | None = None,
     crease_angle: float = 40.0,
 ) -> tuple[Mesh, Textures]:
-    """Read the mesh in a file, and its maps; arguments and errors are those of `sample_mesh`.
+    """Read the mesh in a file, and its maps; arguments and errors as for `sample_mesh`.
 
     **Returns:** the mesh, in mm, and its maps.
     """

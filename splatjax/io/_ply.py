@@ -65,11 +65,11 @@ def read_splats(
     | property | what it is |
     | --- | --- |
     | `x y z` | center, in the file's unit |
-    | `nx ny nz` | normal, made unit; estimated from neighbors when absent |
+    | `nx ny nz` | normal, scaled to unit length; estimated from neighbors when absent |
     | `radius` (or `radii`) | in the file's unit; from the local density when absent |
     | `area` (or `areas`) | in the file's unit squared; from the local density when absent |
     | `red green blue` | albedo: integers are sRGB up to the type's maximum, floats are linear |
-    | `specular`, `roughness` | factors on the material's |
+    | `specular`, `roughness` | factors on the specular strength and roughness of the material |
     | `weight_1_1`, `weight_1_2`, ... | factors on the material's weights: Gaussian, channel |
 
     Other properties and elements are ignored. A file with faces and without radii causes a warning,
@@ -118,7 +118,7 @@ def write_splats(path: StrPath, splats: Splats) -> None:
     `read_splats` gives it back.
 
     **Raises:** `FileNotFoundError` when the folder does not exist, `ValueError` for an albedo that
-    has not three channels.
+    does not have three channels.
     """
     path, names, columns = Path(path), [], []
     for field, aliases in _COLUMNS.items():
@@ -153,7 +153,7 @@ def write_splats(path: StrPath, splats: Splats) -> None:
 class SplatFile:
     r"""Complete splats in a binary PLY file, read part by part, for `splatjax.render_streamed`.
 
-    Their order is that of the file: splats that are near in space should be near in it
+    They keep the order of the file: splats that are near in space should be near in the file
     (`read_splats` sorts, a stream cannot).
 
     **Arguments:**
@@ -165,7 +165,7 @@ class SplatFile:
     - `up`: the file's upward axis, `"y"` or `"z"`.
 
     **Raises:** `FileNotFoundError`, or `ValueError` if the file is not a binary PLY, is truncated,
-    or lacks one of these.
+    or lacks one of these properties.
     """
 
     def __init__(

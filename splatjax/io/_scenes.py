@@ -60,7 +60,7 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
     `file`, `name` and `mm_per_unit` (`load_cameras`). The weights of a material that is named are
     divided by their sums if the splats have albedo, as on the command line.
 
-    **Arguments:** `path`: of a TOML file, or of a picture that the command line rendered.
+    **Arguments:** `path`: path of a TOML file, or of a picture that the command line rendered.
 
     **Raises:** `ValueError` for any other content, with the fault and the remedy;
     `FileNotFoundError` for a missing file.
@@ -100,7 +100,7 @@ def save_scene(
     r"""Write a scene to a TOML file, its splats to a PLY file of the same name, and images of its
     environments to EXR files; `load_scene` reads them.
 
-    Numbers are restored exactly, those of splats and environments in single precision.
+    Numbers are restored exactly, but splats and environments are stored in single precision.
 
     **Raises:** `ValueError` for settings other than bounces and diffusion, and for lights that no
     file can store; `OSError` if a file cannot be written.

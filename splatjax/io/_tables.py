@@ -154,14 +154,14 @@ def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
 
     **Arguments:**
 
-    - `path`: of the file.
-    - `mm_per_unit`: length of the file's unit, mm. Radii are in this unit, and values in one over
-      its square.
+    - `path`: path of the file.
+    - `mm_per_unit`: length of the file's unit, mm. Radii are in this unit, and values per square of
+      this unit.
 
     **Returns:** a `Tabulated` in JAX's default precision, mm and 1/mm^2.
 
-    **Raises:** `FileNotFoundError`, and `ValueError` for what is no such table: file, line and what
-    is wrong.
+    **Raises:** `FileNotFoundError`, and `ValueError`, with file, line and cause, if the file is not
+    such a table.
     """
     check_units(path, mm_per_unit)
     rows = _read_rows(path, "a profile is a CSV of radii and values")
@@ -201,8 +201,8 @@ def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
 
     **Returns:** the names, numbers where there are none, and the three coefficients of each.
 
-    **Raises:** `FileNotFoundError`, and `ValueError` for what is no such table: file, line and what
-    is wrong.
+    **Raises:** `FileNotFoundError`, and `ValueError`, with file, line and cause, if the file is not
+    such a table.
     """
     contents = f"media are a CSV of {', '.join(_COLUMNS)}"
     (_, head), *rows = _read_rows(path, contents) or [("", [])]
@@ -285,8 +285,8 @@ def spectrum_to_rgb(
     **Arguments:**
 
     - `wavelengths`: nm, ascending.
-    - `illuminant`: by its name in colour-science (`colour.SDS_ILLUMINANTS`): "D65", "A", "FL11",
-      ...
+    - `illuminant`: name of the illuminant in colour-science (`colour.SDS_ILLUMINANTS`): "D65", "A",
+      "FL11", ...
 
     **Returns:** one row for each wavelength; the sum of each column is 1.
 

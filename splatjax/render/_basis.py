@@ -36,8 +36,8 @@ class DiffusionBasis(eqx.Module):
     **Attributes:**
 
     - `light`: the layers at every point.
-    - `pixel_radiance_per_exitance`: towards the eye, times the point's fraction of the pixel; 0
-      without a point.
+    - `pixel_radiance_per_exitance`: radiance towards the eye per radiant exitance, times the
+      point's fraction of the pixel; 0 without a point.
     - `pixels`: the index of the pixel of each point, row by row.
     - `in_front`: 1 for a point of the surface in front, else 0.
     - `specular`: radiance, premultiplied.
@@ -83,10 +83,10 @@ def diffusion_basis(
 
     **Arguments:** as for `render`; the weights of `scene.material` do not matter.
 
-    - `derivative`: also differentiate the layers in their variances, for about one more pass 4. The
-      picture then has the derivatives of `picture_jacobian`, in weights, variances and their
-      parameters.
-    - `light`: as for `render`; from `splatjax.illuminate` with the same derivative.
+    - `derivative`: also differentiate the layers with respect to their variances, for about one
+      more pass 4. The picture then has the derivatives of `picture_jacobian`, with respect to
+      weights, variances and their parameters.
+    - `light`: as for `render`; from `splatjax.illuminate` with the same `derivative`.
 
     **Returns:** a `DiffusionBasis`; NaN where the plan does not suffice.
 
@@ -175,8 +175,8 @@ class RelightingBasis(eqx.Module):
 
         **Arguments:**
 
-        - `light`: of the order of the basis or a lower one, such as `HarmonicLight.of(environment,
-          order)`.
+        - `light`: a light of the order of the basis or of a lower order, such as
+          `HarmonicLight.of(environment, order)`.
 
         **Raises:** `ValueError` for a light of a higher order.
         """

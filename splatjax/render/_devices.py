@@ -231,22 +231,24 @@ def along_splats(tree: PyTree, devices: DeviceMesh) -> PyTree:
 def map_over(
     mesh: Mesh, function: Callable[[Any, Any], PyTree], shared: PyTree, batch: PyTree
 ) -> PyTree:
-    r"""Apply a function to each element of a batch, one after the other, with a share of the batch
-    on each device of a mesh.
+    r"""Apply a function to every element of a batch, with the elements divided among the devices of
+    a mesh. Each device computes its elements one after the other, like `jax.lax.map`.
 
-        frames = map_over(mesh, lambda scene, camera: render(scene, camera, plan=plan), scene,
-        cameras)
+        mesh = jax.make_mesh((jax.device_count(),), ("views",))
+        batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+        frames = map_over(mesh, lambda s, camera: render(s, camera, plan=plan), scene, batch)
 
     **Arguments:**
 
-    - `mesh`: of any axes; all its devices are used.
-    - `function`: of `shared` and of one element. Pure; the same function is compiled once.
+    - `mesh`: a mesh of any axes; all its devices are used.
+    - `function`: a pure function of `shared` and one element; the same function is compiled once.
     - `shared`: replicated on every device. Differentiable.
     - `batch`: a tree of arrays with the elements along the first axis, any number; static parts are
       shared. Differentiable.
 
-    **Returns:** the results, stacked along a first axis, which is divided over the devices if their
-    number divides it.
+    **Returns:** the results, stacked along a new first axis. If the number of devices divides the
+    number of elements, this axis stays divided among the devices; otherwise every device has all
+    results.
 
     **Raises:** `ValueError` if the batch is empty, or its arrays have different lengths.
     """

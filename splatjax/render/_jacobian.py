@@ -24,14 +24,14 @@ Parameters = TypeVar("Parameters", bound=PyTree)
 
 
 class PictureJacobian(eqx.Module):
-    r"""The derivatives of every pixel of `beauty` in the material's Gaussians.
+    r"""The derivatives of every pixel of `beauty` with respect to the material's Gaussians.
 
     **Attributes:**
 
     - `frame`: the picture itself.
-    - `weights`: derivative of channel c in weight `[k, c]`, premultiplied by coverage as `beauty`
-      is. A channel does not depend on the weights of other channels.
-    - `variances`: derivative of every channel in variance k, radiance per mm^2.
+    - `weights`: derivative of channel c with respect to weight `[k, c]`, premultiplied by coverage
+      as `beauty` is. A channel does not depend on the weights of other channels.
+    - `variances`: derivative of every channel with respect to variance k, radiance per mm^2.
     """
 
     frame: Frame
@@ -49,18 +49,18 @@ class PictureJacobian(eqx.Module):
     def through(
         self, gaussians_of: Callable[[Parameters], SumOfGaussians], parameters: Parameters
     ) -> Parameters:
-        r"""Compute the Jacobian in the parameters of the Gaussians, such as coefficients and
-        thicknesses.
+        r"""Compute the Jacobian with respect to parameters of the Gaussians, such as coefficients
+        and thicknesses.
 
         **Arguments:**
 
-        - `gaussians_of`: from parameters to the Gaussians of the picture, such as
+        - `gaussians_of`: computes the Gaussians of the picture from the parameters, such as
           `fit_gaussians(Dipole(medium)).gaussians`. It is differentiated in forward mode; the
           picture is not rendered again.
         - `parameters`: a record or a tree of arrays, all floating-point.
 
         **Returns:** a tree like `parameters`; a leaf of shape `s` becomes the derivative of
-        `beauty` in it, `[height, width, channels, *s]`.
+        `beauty` with respect to this leaf, `[height, width, channels, *s]`.
 
         **Raises:** `ValueError` when `gaussians_of(parameters)` has other Gaussians than the
         picture.
@@ -86,13 +86,13 @@ def picture_jacobian(
     settings: RenderSettings = RenderSettings(),
     plan: Plan | None = None,
 ) -> PictureJacobian:
-    r"""Render, and differentiate every pixel of `beauty` in the weights and variances of the
-    material.
+    r"""Render, and differentiate every pixel of `beauty` with respect to the weights and variances
+    of the material.
 
     The result is the derivative of the picture that `render` computes, with its approximations, and
     equals reverse mode for each pixel. It takes less than two and a half times as long as `render`,
     for any number of pixels or parameters. It is the Jacobian of Gauss and Newton's method for
-    least squares; `through` computes the Jacobian in optical coefficients.
+    least squares; `through` computes the Jacobian with respect to optical coefficients.
 
     **Arguments:** as for `render`; under `jit` a plan is needed. With `ClusterDiffuser`, it cannot
     be differentiated again.

@@ -31,7 +31,7 @@ class ShadowPlan(eqx.Module):
     **Attributes:**
 
     - `raster`: their capacity.
-    - `settings`: of the maps and their comparison.
+    - `settings`: settings of the maps and their comparison.
     - `cube`: whether the maps are the six faces of a cube, for a point light among the splats.
       Static.
     - `splats_per_disc`: how many splats are merged into each disc in the maps. Static.
@@ -95,9 +95,9 @@ class Transfer(eqx.Module):
 
     **Attributes:**
 
-    - `visibility`: of each sample of lights of one kind, along the splats in the order of the plan;
-      `None` for lights that cast no shadows.
-    - `needed`: capacity needed over planned.
+    - `visibility`: for each kind of lights the visibility of each sample, along the splats in the
+      order of the plan; `None` for lights that cast no shadows.
+    - `needed`: needed capacity divided by planned capacity.
     """
 
     visibility: list[Float[Array, "_samples splats"] | None]
@@ -110,8 +110,9 @@ class LightVisibility(eqx.Module):
     **Attributes:**
 
     - `groups`: samples of lights of one kind, stacked.
-    - `visibility`: per group, of each sample; `None` for lights that cast no shadows.
-    - `needed`: capacity needed over planned.
+    - `visibility`: for each group the visibility of each sample; `None` for lights that cast no
+      shadows.
+    - `needed`: needed capacity divided by planned capacity.
     """
 
     groups: list[StackedLights]
@@ -122,7 +123,7 @@ class LightVisibility(eqx.Module):
         self, positions: Float[Array, "points 3"], normals: Float[Array, "points 3"]
     ) -> tuple[Float[Array, "_lights points"] | None, ...]:
         """Average the visibility of each light's samples, weighted by their unshadowed light; if
-        all are below the horizon, as if all grazed the surface.
+        all samples are below the horizon, as if all grazed the surface.
         """
 
         def received(light):
@@ -226,7 +227,7 @@ def irradiance_at_points(
 
     **Arguments:**
 
-    - `light`: with the visibility at these points.
+    - `light`: the light, with the visibility at these points.
     - `normals`: unit.
     """
     f0 = _shading.fresnel_f0(material.eta)

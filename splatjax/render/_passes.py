@@ -45,13 +45,15 @@ class SplatLight(eqx.Module):
 
     **Attributes:** along the splats, in the order of the plan
 
-    - `visibility`: of each light.
+    - `visibility`: the visibility of each light.
     - `irradiance`: the irradiance that enters, and the part that spreads.
-    - `layers`: of pass 4.
-    - `derivative`: of the layers in the logarithms of their variances; `None` if not requested.
-    - `added_source`: the derivative of the spreading irradiance in a weight of the Gaussians;
-      `None` if it is zero. Its layers follow those of the irradiance, channel by channel.
-    - `needed`: capacity needed over planned.
+    - `layers`: the layers of pass 4.
+    - `derivative`: derivative of the layers with respect to the logarithms of their variances;
+      `None` if not requested.
+    - `added_source`: the derivative of the spreading irradiance with respect to a weight of the
+      Gaussians; `None` if it is zero. Its layers follow the layers of the irradiance, channel by
+      channel.
+    - `needed`: needed capacity divided by planned capacity.
     - `solved`: the state of a diffuser that solves for the light, along all splats; otherwise
       `None`.
     """

@@ -56,7 +56,7 @@ class Plan(eqx.Module):
     - `raster`: the capacity for the views of the cameras.
     - `sightlines`: the visibility between splats; `None` without bounces.
     - `mesh`: the devices of the splats; `None` for one. Static.
-    - `splats`, `gaussians`: their numbers. Static.
+    - `splats`, `gaussians`: number of splats, and of Gaussians. Static.
     """
 
     order: Int[Array, " places"]
@@ -90,20 +90,32 @@ def make_plan(
     settings: RenderSettings = RenderSettings(),
     mesh: Mesh | None = None,
 ) -> Plan:
-    r"""Compute the array sizes and the order of the splats, which `jit` and `grad` need in advance.
+    r"""Plan a picture: choose the array sizes that JAX must know before it compiles.
+
+        plan = make_plan(scene, camera)  # once, outside of jit and grad
+        frame = eqx.filter_jit(lambda scene: render(scene, camera, plan=plan))(scene)
+        assert frame.overflow == 0  # otherwise the picture is NaN: make a new plan
+
+    How many splats fall on a tile, or near a splat, depends on the scene, but under `jit` the sizes
+    of arrays must be fixed. A plan fixes them, with some to spare, together with the order of the
+    splats.
 
     **Arguments:** concrete arrays, so call it outside of `jit` and `grad`.
 
     - `scenes`: one, or several that differ only in their lights: the same splats and material,
       lights of the same kinds in the same order.
     - `cameras`: one or several, whose pictures have one size.
-    - `settings`: those of the pictures.
-    - `mesh`: devices over which the splats are divided for rendering; planned on one.
+    - `settings`: the settings of the pictures.
+    - `mesh`: devices over which the splats are divided for rendering; the plan is made on one.
 
-    **Returns:** a `Plan` for every scene with every camera, and for scenes and materials near
-    these: variances within a factor of 1.25, relative movements of splats below a tenth of a
-    layer's width, light of any strength and color, and every environment. A light that casts
-    shadows from elsewhere may need more capacity.
+    **Returns:** a `Plan` for every one of the scenes with every camera. It also serves scenes that
+    differ from these by
+
+    - lights of any strength and color, and any environment;
+    - variances within a factor of 1.25;
+    - movements of splats against each other by less than a tenth of the width of a layer.
+
+    A light that casts shadows from another place may need a new plan.
 
     **Raises:** `ValueError` for incompatible cameras or scenes, or a rasterizer or diffuser that
     does not work over a mesh.

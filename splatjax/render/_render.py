@@ -36,24 +36,24 @@ def render(
 
         plan = make_plan(scene, camera)
         frame = render(scene, camera, plan=plan)
-        gradient = eqx.filter_grad(lambda scene: render(scene, camera, plan=plan).beauty.mean())
+        gradient = eqx.filter_grad(lambda s: render(s, camera, plan=plan).beauty.mean())(scene)
 
     **Arguments:**
 
     - `scene`: splats (mm), lights and material. Differentiable; the choice of visible splats is
       not.
     - `camera`: position and size of the picture. Differentiable.
-    - `settings`: of the passes.
-    - `plan`: from `splatjax.make_plan`, for this scene or one near it. Required under `jit`, `grad`
-      and `vmap`; otherwise made for each call.
+    - `settings`: settings of the passes.
+    - `plan`: a plan from `splatjax.make_plan`, for this scene or a similar one. Required under
+      `jit`, `grad` and `vmap`; otherwise made for each call.
     - `mesh`: devices over which the splats and their gradients are divided, of any axes
       (docs/devices.md). By default the mesh of the plan.
-    - `light`: a precomputed result for the same settings and plan: from `splatjax.illuminate` with
-      the same scene, passes 1 and 4, which do not depend on the camera; or from `splatjax.transfer`
-      with the same splats, pass 1, which does not depend on the strength of lights. Differentiable.
+    - `light`: a precomputed result for the same settings and plan, to save time. For the same scene
+      and another camera, from `splatjax.illuminate` (passes 1 and 4); for the same splats and
+      lights of another strength, from `splatjax.transfer` (pass 1). Differentiable.
 
-    **Returns:** a `Frame` in the dtype of `splats.centers`. It is the same on every device, and for
-    every mesh to rounding.
+    **Returns:** a `Frame` in the dtype of `splats.centers`. With a mesh, every device has the whole
+    frame, equal to that without a mesh up to rounding.
 
     **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another
     number of splats, when `light` is for other kinds of lights, or when the scene's channels
@@ -95,11 +95,11 @@ def illuminate(
     **Arguments:**
 
     - `scene`: Differentiable.
-    - `plan`: from `splatjax.make_plan`.
-    - `settings`: those of the plan.
+    - `plan`: a plan from `splatjax.make_plan`.
+    - `settings`: the settings of the plan.
     - `derivative`: as for `diffusion_basis`.
-    - `light`: from `splatjax.transfer` with the same splats, settings and plan, for lights of the
-      same kinds in the same order; no shadow map is rendered. Differentiable.
+    - `light`: a result of `splatjax.transfer` with the same splats, settings and plan, for lights
+      of the same kinds in the same order; no shadow map is then rendered. Differentiable.
 
     **Returns:** the light on the splats, in the order of the plan.
 

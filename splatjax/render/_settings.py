@@ -71,23 +71,32 @@ class LightAtSplats(AbstractLighting):
 class RenderSettings(eqx.Module):
     r"""Settings of the passes, and the algorithms that compute them.
 
-    **Attributes:** (the defaults suit most pictures)
+        settings = RenderSettings(bounces=1, shadows=ShadowSettings(resolution=2048))
+        frame = render(scene, camera, settings, make_plan(scene, camera, settings))
 
-    - `splatting`: of passes 2 and 3: depth of the front surface (epsilon-z), screen filter.
-    - `shadows`: of pass 1: resolution, bias and softness of shadow maps.
+    Pass the same settings to `make_plan` and to `render`. The defaults suit most pictures. Change
+    `bounces` for light that leaves the body and lights it again, `diffuser` for less time
+    (`ExitanceDiffuser`) or thin parts (`ShapeDiffuser`), and `sample_shadows` for sharper shadows
+    of environments and area lights.
+
+    **Attributes:**
+
+    - `splatting`: passes 2 and 3: how far behind the foremost fragment the front surface extends
+      (epsilon-z), and the filter of splats smaller than a pixel.
+    - `shadows`: pass 1: resolution, bias and softness of shadow maps.
     - `sample_shadows`: the same for the samples of environments and area lights, which are many, so
-      each map is coarser. `ShadowSettings()` makes them as fine as those of other lights.
+      each map is coarser. `ShadowSettings()` makes their maps as fine as those of other lights.
     - `bounces`: number of times that light may leave the body and enter it again. Static.
     - `sightlines`: the directions in which each splat searches the body, for bounces.
-    - `kernel`: of pass 4: source depth, normalization, and resolution of a layer.
-      `EscapeNormalization()`, or `PlainMean()`, that of the paper.
+    - `kernel`: pass 4: source depth, normalization, and resolution of a layer.
+      `EscapeNormalization()`, or `PlainMean()`, the kernel of the paper.
     - `rasterizer`: algorithm of passes 1 to 3. `TileRasterizer()`, or `DenseRasterizer()`, the
       plain reference.
     - `diffuser`: algorithm of pass 4. `ClusterDiffuser()`; `ExitanceDiffuser()`, the same in less
       time, without separate layers; `DenseDiffuser()`, the plain reference; or `ShapeDiffuser()`,
       which solves the diffusion equation in the body.
-    - `lighting`: where irradiance is computed. `LightAtSplats()` blends that of the splats;
-      `splatjax.baselines` has others.
+    - `lighting`: where irradiance is computed. `LightAtSplats()` blends the irradiance of the
+      splats; `splatjax.baselines` has other classes.
     """
 
     splatting: _splatting.SplattingSettings = _splatting.SplattingSettings()

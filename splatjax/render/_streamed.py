@@ -71,8 +71,8 @@ def render_streamed(
     - `report`: called after each part with the name of the stage, and the number of finished
       splats.
 
-    **Returns:** the frame of `render`, to rounding except for pass 4. There clusters are those of
-    each part, and layers are evaluated at the visible points, so the difference is below the error
+    **Returns:** the frame of `render`, to rounding except for pass 4. There each part has its own
+    clusters, and layers are evaluated at the visible points, so the difference is below the error
     of the diffuser. There are no gradients.
 
     **Raises:** `ValueError` when there are no splats, parts differ in size, are not the same each

@@ -21,18 +21,20 @@ class SurfaceAttributes(eqx.Module):
 
     **Attributes:**
 
-    - `normals`: of the splats; blended ones are not of unit length.
+    - `normals`: normals of the splats; blended normals are not of unit length.
     - `area`: per splat, mm^2.
     - `source`: irradiance that spreads below the surface.
     - `albedo`, `irradiance`, `specular`, `roughness`: `None` if the splats have none; `irradiance`
       is then `source`.
     - `weights`: factors on the weights of the material; `None` if the splats have none.
-    - `visibility`: per group of samples, of each light; `None` for lights that cast no shadows.
+    - `visibility`: for each group of samples the visibility of each light; `None` for lights that
+      cast no shadows.
     - `single_scattering`: radiance towards the eye, without the albedo; `None` if the material has
       none.
     - `layers`, `derivative`: the layers of pass 4 as `continue_from_splats` prepares them, and
       their derivatives; `centers` are the splats', mm from an origin.
-    - `added_source`: the derivative of `source` in a weight of the Gaussians, if it is not zero.
+    - `added_source`: the derivative of `source` with respect to a weight of the Gaussians, if it is
+      not zero.
     - `extra`: attributes of another `AbstractLighting`.
     """
 
@@ -58,12 +60,13 @@ class SurfaceSamples(eqx.Module):
 
     **Attributes:**
 
-    - `attributes`: blended.
+    - `attributes`: the blended attributes.
     - `positions`: mm.
     - `depth`: mm along the camera's forward axis.
     - `covered`: whether a surface is visible.
     - `layers`: means and mass at the positions; none before they are computed.
-    - `derivative`: of the layers in the logarithms of their variances; `None` if not requested.
+    - `derivative`: derivative of the layers with respect to the logarithms of their variances;
+      `None` if not requested.
     """
 
     attributes: SurfaceAttributes

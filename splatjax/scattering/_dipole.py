@@ -91,8 +91,9 @@ class AbstractDipole(AbstractHalfSpace):
 
             alpha'/2 exp(-s z_r) { C_E (1 + exp(-s h)) + C_phi / D (1 - exp(-s h)) / s }
 
-        **Returns:** in [0, 1]; 1 where `sigma_a = 0`. There its derivative in `sigma_a` diverges
-        like `-sigma_a^(-1/2)`, so that autodiff returns infinity at `sigma_a = 0`, on purpose.
+        **Returns:** in [0, 1]; 1 where `sigma_a = 0`. There its derivative with respect to
+        `sigma_a` diverges like `-sigma_a^(-1/2)`, so that autodiff returns infinity at `sigma_a =
+        0`, on purpose.
 
         **Source:** Jensen et al. 2001, section 2.4, for the classical dipole.
         """
@@ -108,12 +109,19 @@ class AbstractDipole(AbstractHalfSpace):
 class Dipole(AbstractDipole):
     r"""The classical dipole: the profile of a half space, with which most fits are published.
 
-    With `z_r = 1 / sigma_t'`, `z_v = z_r (1 + 4A/3)` and `d^2 = r^2 + z^2`,
+        Dipole(load_medium("marble"))(jnp.linspace(0.5, 2, 3))  # [radii, channels], 1/mm^2
+
+    With `sigma_t' = sigma_a + sigma_s'`, `alpha' = sigma_s' / sigma_t'`, `sigma_tr^2 = 3 sigma_a
+    sigma_t'`, `A = (1 + Fdr) / (1 - Fdr)` with the diffuse reflectance `Fdr` of the surface from
+    inside, `z_r = 1 / sigma_t'`, `z_v = z_r (1 + 4A/3)` and `d^2 = r^2 + z^2`,
 
         R(r) = alpha' / (4 pi) * sum over z in (z_r, z_v) of z (1 + sigma_tr d) exp(-sigma_tr d) /
         d^3.
 
-    **Attributes:** `medium` and `fresnel`, as for every half space.
+    **Attributes:**
+
+    - `medium`: coefficients, [channels]. Differentiable.
+    - `fresnel`: `ExactFresnel()`, or `EganFresnel()` for the polynomial of published fits.
 
     **Source:** Jensen, Marschner, Levoy and Hanrahan 2001, Eq. 4 (with both depths positive).
     """
@@ -129,11 +137,15 @@ class BetterDipole(AbstractDipole):
     r"""The dipole of d'Eon, with Grosjean's diffusion coefficient and an exitance of fluence and
     flux. It is more accurate than the classical one at strong absorption.
 
-    With `D = (2 sigma_a + sigma_s') / (3 sigma_t'^2)`, `sigma_tr^2 = sigma_a / D`, `A = (1 + 3 C2)
-    / (1 - 2 C1)`, `z_r = 1 / sigma_t'`, `z_v = z_r + 4 A D`, `C_phi = (1 - 2 C1) / 4` and `C_E = (1
-    - 3 C2) / 2`.
+    It is the sum of `AbstractDipole` with `D = (2 sigma_a + sigma_s') / (3 sigma_t'^2)`,
+    `sigma_tr^2 = sigma_a / D`, `A = (1 + 3 C2) / (1 - 2 C1)`, `z_r = 1 / sigma_t'`, `z_v = z_r + 4
+    A D`, `C_phi = (1 - 2 C1) / 4` and `C_E = (1 - 3 C2) / 2`, where `2 C1` and `3 C2` are the
+    moments of the internal reflectance (`AbstractFresnel`).
 
-    **Attributes:** `medium` and `fresnel`, as for every half space.
+    **Attributes:**
+
+    - `medium`: coefficients, [channels]. Differentiable.
+    - `fresnel`: `ExactFresnel()`, or `EganFresnel()` for the polynomial of published fits.
 
     **Source:** d'Eon 2012, "A better dipole"; diffusion coefficient: Grosjean 1956.
     """

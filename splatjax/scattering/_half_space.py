@@ -70,7 +70,7 @@ class AngularLaw(eqx.Module):
     def projected(
         self, total: Float[Array, " channels"], matrix: Float[Array, "channels colors"]
     ) -> "AngularLaw":
-        """Return the law of sums over the channels, weighted by their total reflectance."""
+        """Return the law for sums of channels, which are weighted by their total reflectance."""
         return AngularLaw((self.coefficients * total[None]) @ matrix / (total @ matrix)[None])
 
     def __call__(self, mu: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
@@ -81,7 +81,8 @@ class AngularLaw(eqx.Module):
 
 @record
 class HalfSpace(eqx.Module):
-    r"""The reflection by a half space of the light that has entered it, by light transport.
+    r"""How much of the light that enters a half space leaves it again, by its angle: computed by
+    light transport, without the diffusion approximation.
 
     Adding and doubling: the reflection and transmission of a layer between discrete cosines give
     those of two such layers, and so on to a half space. The surface is added last; it reflects from
@@ -93,8 +94,8 @@ class HalfSpace(eqx.Module):
 
     - `medium`: its coefficients, [channels]; `eta` at least 1.
     - `g`: mean cosine of the phase function, [channels]; `sigma_s = sigma_s' / (1 - g)`.
-    - `cover`: a layer on the half space, thin or thick, or `None`; its index and mean cosine are
-      those of the half space.
+    - `cover`: a layer on the half space, thin or thick, with the index and mean cosine of the half
+      space; or `None`.
 
     **Source:** Van de Hulst 1980 (doubling); Prahl, Van Gemert and Welch 1993 (adding the
     surface); Wiscombe 1977 (delta-M).
@@ -123,14 +124,15 @@ class HalfSpace(eqx.Module):
         `subsurface_scatter_anisotropy`. For Blender's Principled BSDF: base color, radius times
         scale, IOR and anisotropy of its random walk.
 
-        **Arguments:** (numbers, or one for each channel; differentiable but at color 1)
+        **Arguments:** (one number for all channels, or one for each; differentiable except at a
+        color of 1)
 
         - `color`: between 0.001 and 1.
         - `mean_free_path`: `1 / sigma_t`, mm, positive.
         - `eta`, `g`: as in the attributes.
 
-        **Returns:** a half space whose color, over that of white, is within 1e-4 of the given
-        color; in single precision within 2e-2.
+        **Returns:** a half space whose `color()`, divided by that of a medium without absorption,
+        equals the given color within 1e-4 (in single precision, within 2e-2).
 
         **Raises:** `ValueError` for a number out of its range.
         """
@@ -161,8 +163,8 @@ class HalfSpace(eqx.Module):
 
     @jit_unless_traced
     def color(self) -> Float[Array, " channels"]:
-        """Compute the fraction that leaves of diffuse light that has entered: the color of a flat
-        surface in a white furnace, without the reflection of its surface.
+        """Compute the color of a flat surface under even light: the fraction of the light that has
+        entered and leaves again. Light that the surface itself reflects does not count.
         """
         return self._by_channel(_diffuse_albedo)
 

@@ -144,7 +144,7 @@ class AbstractFresnel(eqx.Module):
     r"""The reflectance of a smooth interface for diffuse light from inside.
 
     With `F(mu)` the internal reflectance, total internal reflection included, and `eta` the index
-    inside over outside.
+    inside divided by the index outside.
     """
 
     @abc.abstractmethod
@@ -200,9 +200,9 @@ class ExactFresnel(AbstractFresnel):
 class EganFresnel(AbstractFresnel):
     r"""The polynomial fits with which published profiles were computed.
 
-    The first moment is that of Egan and Hilgeman as Donner and Jensen print it, the second that of
-    d'Eon and Irving. They are valid for `eta` between about 0.5 and 2. Differentiable except at
-    `eta = 1`, where the fits step by 0.0017; there the moments are set to 0, so that A = 1.
+    The first moment is the fit of Egan and Hilgeman as printed by Donner and Jensen, the second the
+    fit of d'Eon and Irving. They are valid for `eta` between about 0.5 and 2. Differentiable except
+    at `eta = 1`, where the fits step by 0.0017; there the moments are set to 0, so that A = 1.
 
     **Source:** Egan and Hilgeman 1979; Donner and Jensen 2005; d'Eon and Irving 2011.
     """

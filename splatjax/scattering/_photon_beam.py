@@ -27,8 +27,8 @@ class SingleScattering(AbstractProfile):
     r"""Light scattered once in a half space, isotropically with the reduced coefficient: as a
     profile, and as radiance in a picture.
 
-    The profile is that of light along the normal: after the scattering it travels to the surface,
-    attenuated, and through it with the Fresnel transmittance. With theta the angle inside,
+    The profile is for light along the normal: after the scattering, light travels to the surface,
+    attenuated, and through the surface with the Fresnel transmittance. With theta the angle inside,
 
         R1(r) = alpha' sigma_t' / (4 pi r) * integral of exp(-sigma_t' r cot(theta / 2)) (1 - F)
         cos(theta) d theta.
@@ -179,8 +179,8 @@ class PhotonBeam(AbstractHalfSpace):
 
     @jit_unless_traced
     def with_total(self, total: Float[Array, " channels"]) -> "PhotonBeam":
-        """Scale multiple scattering so that the total reflectance is `total`, such as that of light
-        transport (`HalfSpace`), from which the model's own differs by 1 to 6%.
+        """Scale multiple scattering so that the total reflectance is `total`, such as the total of
+        light transport (`HalfSpace`), from which the model's own total differs by 1 to 6%.
         """
         single = SingleScattering(self.medium).total_reflectance()
         multiple = self.multiply_scattered().total_reflectance() / self.strength

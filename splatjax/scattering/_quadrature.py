@@ -42,7 +42,7 @@ class RadialRule(AbstractRadialRule):
     **Attributes:**
 
     - `smallest`, `largest`: ends of the logarithmic panel, in length scales.
-    - `count`: its number of nodes.
+    - `count`: number of nodes of the logarithmic panel.
     - `near`: number of nodes of the linear panel; 0 omits it.
     - `tail`: a further power of r in the weights, for a better fit at large distances: 0 is Eq. 3.
     """
@@ -109,8 +109,8 @@ class InverseVariance(AbstractRadialRule):
     r"""The radii of a table, each weighted by its standard error: integrals of `r f(r)^2` become
     sums of `f^2 / deviation^2`.
 
-    A fit with this rule has the least chi-squared, and its `error` is the root of chi-squared over
-    the sum of `(R / deviation)^2`. Radii without an error, which no photon reached, are omitted.
+    A fit with this rule minimizes chi-squared, and its `error` is `sqrt(chi_squared / sum((R /
+    deviation)^2))`. Radii with a standard error of 0, which no photon reached, are omitted.
 
     **Attributes:**
 

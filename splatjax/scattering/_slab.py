@@ -289,12 +289,17 @@ class Multipole(AbstractSlabProfile):
 
 @record
 class LayeredMultipole(AbstractSlabProfile):
-    r"""Any number of layers, each a multipole, added in the Hankel domain.
+    r"""The profile of a stack of layers, such as skin, or a glaze on stone.
+
+        glazed = LayeredMultipole([Layer(glaze, 0.5), Layer(stone, jnp.inf)])  # from the top, mm
+        glazed(jnp.linspace(0.5, 2, 3))  # [radii, channels], 1/mm^2
+
+    Each layer is a multipole; they are combined by adding, in the Hankel domain.
 
     Between two scattering layers the interface has the ratio of their indices; a film has no
     interface. Light enters from above as a narrow beam. Each slab has its own extrapolated
-    boundaries, so dividing one in two, with matched indices, changes the result: by a few per cent
-    at four mean free paths.
+    boundaries. Dividing a slab into two layers of the same medium therefore changes the result, by
+    a few per cent for a slab four mean free paths thick.
 
     Differentiable in every coefficient and thickness, and in `r`.
 

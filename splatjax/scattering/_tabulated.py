@@ -21,15 +21,15 @@ class Tabulated(AbstractProfile):
     r"""A profile given at radii, linear in between: constant within the first radius, 0 beyond the
     last.
 
-    There is no extrapolation: light beyond the last radius is not part of the total unless the
-    total is given, and integrals of the profile, also those of a fit, are sums over its radii.
-    Differentiable in values, radii, `r`, and the total.
+    Nothing is extrapolated: light beyond the last radius counts only if `total` is given.
+    Integrals, including those of a fit, are sums over the given radii. Differentiable in values,
+    radii, `r`, and the total.
 
     **Attributes:**
 
     - `radii`: mm, at least two; they ascend from at least 0.
     - `values`: 1/mm^2, one row per radius. Noise may make them negative.
-    - `deviation`: standard errors of the values, of their shape, or None if they are unknown.
+    - `deviation`: standard errors of the values, with the same shape, or None if they are unknown.
       Constants of every derivative.
     - `total`: the total reflectance of each channel; None for the integral of the straight lines.
 
@@ -80,7 +80,7 @@ class Tabulated(AbstractProfile):
 
     @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Return the total, or compute `2 pi` times the integral of `r R(r)`, exactly that of the
+        """Return the total, or compute `2 pi` times the integral of `r R(r)`, exact for the
         straight lines.
         """
         if self.total is not None:
@@ -92,7 +92,7 @@ class Tabulated(AbstractProfile):
 
     @jit_unless_traced
     def length_scale(self) -> Float[Array, " channels"]:
-        """Compute the radius, mm, within which half of the integral of `r |R|` is, by the steps of
+        """Compute the radius, mm, within which half of the integral of `r |R|` lies, in steps of
         the table.
         """
         rings = self.radii * jnp.diff(self.radii, append=self.radii[-1:])
@@ -115,9 +115,9 @@ class LaserDot(eqx.Module):
     **Attributes:**
 
     - `profile`: means over rings, with their standard errors, 1/mm^2: the profile of the material
-      convolved with that of the beam.
-    - `center`: of the dot, pixels: x to the right and y down, from the upper left corner of the
-      picture.
+      convolved with the profile of the beam.
+    - `center`: center of the dot, pixels: x to the right and y down, from the upper left corner of
+      the picture.
     """
 
     profile: Tabulated
@@ -143,18 +143,19 @@ def measure_laser_dot(
     **Arguments:**
 
     - `image`: linear radiance.
-    - `mm_per_pixel`: on the surface, positive.
-    - `power`: entering the material, positive, for all channels or for each: in W if the image is
-      in W/(mm^2 sr). It scales the profile, and with it the total reflectance.
+    - `mm_per_pixel`: width of a pixel on the surface, mm, positive.
+    - `power`: power that enters the material, positive, for all channels or for each: in W if the
+      image is in W/(mm^2 sr). It scales the profile, and with it the total reflectance.
     - `center`: x and y in pixels; by default the centroid of the pixels above a fifth of the peak.
     - `saturation`: the value at which pixels saturate; a ring with such a pixel is omitted.
-    - `largest`: radius of the last ring, mm; by default that of the largest circle inside the
+    - `largest`: radius of the last ring, mm; by default the radius of the largest circle inside the
       picture.
     - `step`: width of a ring, pixels, at least 1.
 
-    **Returns:** a `LaserDot`. The radius of a ring is the root mean square of those of its pixels,
-    because the middle of a profile is flat. Its standard error excludes the scatter due to the
-    slope across the ring. Rings of fewer than twelve pixels are joined to the next.
+    **Returns:** a `LaserDot`. The radius of a ring is the root mean square of the radii of its
+    pixels, because the middle of a profile is flat. The standard error of a ring excludes the
+    scatter due to the slope across the ring. Rings of fewer than twelve pixels are joined to the
+    next.
 
     **Raises:** `ValueError` for pixels that are not finite, a length or power that is not positive,
     a center outside of the picture, and if fewer than two rings are left.

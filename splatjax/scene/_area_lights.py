@@ -111,8 +111,8 @@ class RectangleLight(AbstractAreaLight):
     **Attributes:**
 
     - `center`: mm. Differentiable.
-    - `radiance`: of the emitting side. A white diffuser under a whole sky of this radiance has the
-      same radiance. Differentiable.
+    - `radiance`: radiance of the emitting side. A white diffuser under a whole sky of this radiance
+      has the same radiance. Differentiable.
     - `edges`: two edge vectors, perpendicular, mm: the rectangle extends by half of each to either
       side of `center`. It emits in the direction of their cross product. Differentiable.
     - `count`, `cast_shadows`: static.

@@ -31,23 +31,26 @@ class EnvironmentLight(AbstractExtendedLight):
     is +y and the lower one -y; the middle is +z, a quarter of the width to the left of it is +x,
     and both side edges are -z. This is the view from inside the sphere.
 
-    It is sampled by `count` directions. The sphere is divided into strata of equal importance, of
-    which 90% is radiance times solid angle and 10% solid angle. A sample has the irradiance of all
-    pixels of its stratum, the mean direction of their radiance, and a shadow map. Highlights are
-    not sampled: glossy surfaces reflect the image, blurred by the lobe.
+        sky = EnvironmentLight(overcast_sky(), rotation=30, strength=0.5)
+
+    The light is sampled by `count` directions. For this, the sphere is divided into parts of equal
+    importance: 90% by their light (radiance times solid angle), and 10% by their solid angle alone,
+    so that no direction is far from a sample. Each sample carries the light of its whole part,
+    comes from the mean direction of that light, and has its own shadow map. Highlights are not
+    sampled: glossy surfaces reflect the image, blurred by the lobe.
 
     **Attributes:**
 
     - `image`: radiance, linear; twice as wide as high, gray or in color. Differentiable; the
-      boundaries of the strata are constants.
+      boundaries of the parts are constants.
     - `rotation`: degrees about `up`; a positive angle turns +z towards +x. Differentiable.
     - `strength`: a factor on each channel. Differentiable.
     - `up`: the direction of the image's upper edge: (0, 0, 1) for a world whose z is up; the middle
       of the image is then -y. Any length but zero. Differentiable.
     - `directions`: world directions of the samples, any length but zero; `None` to choose the
-      samples by the image. With given directions, a kept visibility is valid for every image and
-      rotation (`splatjax.transfer`). The light of every pixel is distributed to the directions near
-      it.
+      samples by the image. With given directions, the visibility that `splatjax.transfer` computes
+      stays valid for every image and rotation. The light of every pixel is distributed to the
+      directions near it.
     - `count`: number of samples that are chosen by the image. Static.
     - `cast_shadows`: whether it has shadow maps. Static.
 
@@ -81,8 +84,8 @@ class EnvironmentLight(AbstractExtendedLight):
         return self.image * self.strength[None, None]
 
     def to_world(self) -> Float[Array, "3 3"]:
-        """Compute the rotation from the directions of the image to those of the world: about +y,
-        then the shortest rotation from +y to `up`.
+        """Compute the rotation from the directions of the image to directions in the world: about
+        +y, then the shortest rotation from +y to `up`.
         """
         angle = jnp.deg2rad(self.rotation)
         cosine, sine, one = jnp.cos(angle), jnp.sin(angle), jnp.ones_like(angle)

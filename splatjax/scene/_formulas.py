@@ -147,7 +147,7 @@ def studio(height: int = 64) -> Float[Array, "height width 3"]:
 
     **Arguments:**
 
-    - `height`: of the image, which is twice as wide.
+    - `height`: height of the image, which is twice as wide.
 
     **Returns:** radiance; the irradiance of a surface that faces the large softbox is about pi.
     """
@@ -181,8 +181,8 @@ def sun_and_sky(
 
     **Arguments:**
 
-    - `elevation`, `azimuth`: of the sun, degrees; azimuth 0 is +z, 90 is +x. A sun below the
-      horizon gives no light. Differentiable.
+    - `elevation`, `azimuth`: direction of the sun, degrees; azimuth 0 is +z, 90 is +x. A sun below
+      the horizon gives no light. Differentiable.
 
     **Returns:** radiance; a surface that faces the sun receives about 2.2 from it.
     """

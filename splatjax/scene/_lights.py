@@ -166,8 +166,8 @@ class DirectionalLight(AbstractLightSample):
     **Attributes:**
 
     - `direction`: the way the light travels, any length but zero. Differentiable.
-    - `irradiance`: on a surface that faces the light; pi on a white diffuser gives radiance 1.
-      Differentiable.
+    - `irradiance`: irradiance on a surface that faces the light; pi on a white diffuser gives
+      radiance 1. Differentiable.
     - `cast_shadows`: whether it has a shadow map. Static.
     """
 
@@ -231,7 +231,8 @@ class SpotLight(AbstractPointSample):
     **Attributes:**
 
     - `position`: mm. Differentiable.
-    - `direction`: of the axis, the way the light travels, any length but zero. Differentiable.
+    - `direction`: direction of the axis, the way the light travels, any length but zero.
+      Differentiable.
     - `intensity`: power per solid angle inside the inner cone. Differentiable.
     - `inner_angle`, `outer_angle`: degrees from the axis, at most 180. Differentiable.
     - `cast_shadows`: whether it has a shadow map. Static.
@@ -304,8 +305,8 @@ class GaussianBeam(AbstractLightSample):
 
     - `origin`: a point on the axis, mm. Differentiable.
     - `direction`: the way the light travels, any length but zero. Differentiable.
-    - `power`: of the whole beam. Differentiable.
-    - `variance`: per axis, mm^2. Differentiable.
+    - `power`: power of the whole beam. Differentiable.
+    - `variance`: variance of the Gaussian per axis, mm^2. Differentiable.
     """
 
     origin: Float[Array, "3"] = eqx.field(converter=numbers)

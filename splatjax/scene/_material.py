@@ -38,8 +38,8 @@ class Material(eqx.Module):
     - `medium`: coefficients, which `ShapeDiffuser` uses instead of Gaussians, single scattering and
       angles; or `None`.
 
-    **Raises:** `ValueError` for a value out of range, and for a single scattering or angles whose
-    number of channels differs from that of the Gaussians.
+    **Raises:** `ValueError` for a value out of range, and if `single_scattering` or `angles` has
+    another number of channels than the Gaussians.
     """
 
     gaussians: SumOfGaussians
@@ -90,8 +90,8 @@ class Material(eqx.Module):
         """Compute the factor on the Gaussians for light that enters at the cosine `mu_i`; 1 along
         the normal.
 
-        Grazing light leaves after one scattering more often than light along the normal. If the sum
-        of both exceeds 1, the Gaussians are scaled to the difference.
+        Grazing light leaves after a single scattering more often than light along the normal. If
+        single scattering and the Gaussians together exceed 1, the Gaussians get the rest.
         """
         factor = self.angular_law()(mu_i)
         if self.single_scattering is None:

@@ -36,11 +36,11 @@ class Camera(eqx.Module):
       orthonormal. Differentiable.
     - `focal_length`: in heights of the picture: `1 / (2 tan(fov / 2))` for a vertical field of view
       `fov`. Differentiable.
-    - `width`, `height`: of the picture, pixels. Static.
+    - `width`, `height`: size of the picture, pixels. Static.
     - `near`: splats with a center nearer than this along the forward axis are not rendered; mm.
       Static.
-    - `principal_point`: where the forward axis meets the picture: its column over `width` and its
-      row over `height`. `None`: the middle, `[0.5, 0.5]`. Differentiable.
+    - `principal_point`: where the forward axis meets the picture: column divided by `width`, and
+      row divided by `height`. `None`: the middle, `[0.5, 0.5]`. Differentiable.
 
     **Raises:** `ValueError` for a picture without pixels, and for numbers that are not finite.
     """
@@ -75,11 +75,22 @@ class Camera(eqx.Module):
         height: int = 512,
         near: float | int = 1e-2,
     ) -> "Camera":
-        """Place a camera at `eye` (mm) that looks at `target` (mm), with vertical field of view
-        `fov` in degrees.
+        """Place a camera at `eye` that looks at `target`.
+
+            camera = Camera.look_at((66, 4, 140), (0, -9, 0), fov=30, width=640, height=480)
+
+        **Arguments:**
+
+        - `eye`, `target`: mm. `target` appears in the middle of the picture.
+        - `up`: a direction that points upward in the picture, of any length, not along the line of
+          sight.
+        - `fov`: vertical field of view, degrees, between 0 and 180.
+        - `width`, `height`: size of the picture, pixels.
+        - `near`: splats nearer than this are not rendered, mm.
 
         **Raises:** `ValueError` when the field of view or the size of the picture is out of range,
-        and, unless they are traced, for an eye, a target and an `up` on one line.
+        when `eye` equals `target`, and when `up` is along the line of sight; the last two are not
+        checked for traced arrays.
         """
         check_values("fov", fov, "between 0 and 180 degrees", lambda x: (x > 0) & (x < 180))
         points = as_floats([eye, target, up], name="eye, target and up")
@@ -127,14 +138,15 @@ class Splats(eqx.Module):
 
     **Attributes:** (all differentiable unless stated otherwise)
 
-    - `centers`: mm. Visibility is discontinuous in them; coverage and shading are smooth.
+    - `centers`: mm. Coverage and shading are smooth functions of the centers; which splats are
+      visible is not.
     - `normals`: unit vectors, outward.
     - `radii`: mm, positive. Discs overlap so that they leave no hole: about 1.5 times the root of
       the area.
     - `areas`: the area of the surface that each splat represents, mm^2. They add up to the area of
       the surface. (The discs overlap, so `pi r^2` is not the area.)
-    - `albedo`: diffuse color, linear, in [0, 1], which multiplies that of the material; `None` if
-      the material alone gives the color.
+    - `albedo`: diffuse color, linear, in [0, 1], which multiplies the color of the material; `None`
+      if the material alone gives the color.
     - `specular`: factor on the material's specular strength; `None` for 1.
     - `roughness`: factor on the material's roughness; `None` for 1.
     - `weights`: factor on the material's weights, for each Gaussian and channel, by which the
@@ -199,7 +211,7 @@ class Scene(eqx.Module):
     - `splats`: the surface of the body.
     - `lights`: any number, as a list, a tuple, or a single light. A light of one channel applies to
       every channel of the material. Lights of one kind are computed together.
-    - `material`: of all splats. For splats with albedo, usually `material.white()`.
+    - `material`: the material of all splats. For splats with albedo, usually `material.white()`.
     """
 
     splats: Splats
@@ -214,8 +226,8 @@ class Frame(eqx.Module):
     r"""A picture, linear light, row 0 at the top.
 
     `beauty`, `diffuse`, `specular`, `layers`, `albedo` and `irradiance` are premultiplied by
-    coverage; `depth`, `position` and `normal` are those of the front surface and are not. `diffuse
-    = sum_k weights_k layers_k` everywhere.
+    coverage; `depth`, `position` and `normal` belong to the front surface and are not
+    premultiplied. `diffuse = sum_k weights_k layers_k` everywhere.
 
     **Attributes:**
 
@@ -224,12 +236,13 @@ class Frame(eqx.Module):
     - `depth`: along the camera's forward axis, mm; inf where no surface is visible.
     - `position`: world space, mm; 0 where no surface is visible.
     - `normal`: world space, unit; 0 where no surface is visible.
-    - `albedo`: of the splats; 1 if they have none.
+    - `albedo`: albedo of the splats; 1 if they have none.
     - `shadow`: per light, 1 lit and 0 in shadow, not premultiplied; 1 where no surface is visible.
     - `irradiance`: the irradiance that enters the surface, including cosine, shadow and the loss to
       the specular lobe.
-    - `layers`: one per Gaussian, `sqrt(albedo) exit_transmission / pi * L_k`.
-    - `weights`: of the Gaussians of the picture.
+    - `layers`: one per Gaussian: the radiance of the light that this Gaussian spreads, before its
+      weight is applied.
+    - `weights`: the weights with which the layers add up to `diffuse`.
     - `diffuse`, `specular`: radiance.
     - `unresolved_fraction`: per Gaussian, the fraction of the covered pixels in which the splats do
       not resolve the layer, so that the surface's own irradiance replaces it.

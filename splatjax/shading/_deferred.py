@@ -23,9 +23,9 @@ def diffuse_transmission(
     roughness: Float[Array, "..."],
     angles: AngularLaw,
 ) -> Float[Array, "channels ..."]:
-    r"""Compute the angular factor of diffuse light that leaves: `e(mu) (1 - rho(mu))` over its
-    average, weighted with `2 mu`. The transmission depends only on index and roughness, not on the
-    strength of the specular lobe.
+    r"""Compute the angular factor of diffuse light that leaves: `e(mu) (1 - rho(mu))` divided by
+    its average, weighted with `2 mu`. The transmission depends only on index and roughness, not on
+    the strength of the specular lobe.
 
     The radiance of a surface of radiant exitance `M` is `M diffuse_transmission(mu_o) / pi`. Since
     the average is one, the light that leaves is exactly `M`.
@@ -33,7 +33,7 @@ def diffuse_transmission(
     **Arguments:** as in `directional_albedo`; `mu` is the cosine of the direction towards the
     camera.
 
-    - `angles`: `e`, of a material.
+    - `angles`: the law `e` of a material.
 
     **Returns:** at least 0, with the channels of `angles` as first axis. The average is kept above
     1e-4 (gradient 0 below): a surface that reflects all light transmits none, so `M` is 0 there.
@@ -52,9 +52,9 @@ def average_transmission(
     angles: AngularLaw,
 ) -> Float[Array, "channels ..."]:
     """Compute the average of `e(mu) (1 - rho(mu))`, weighted with `2 mu`: the transmitted fraction
-    of uniform light, over that of light along the normal.
+    of uniform light, relative to light along the normal.
 
-    **Arguments:** as of `diffuse_transmission`.
+    **Arguments:** as for `diffuse_transmission`.
 
     **Returns:** with the channels of `angles` as first axis.
     """

@@ -51,11 +51,12 @@ class Bins(eqx.Module):
 
     **Attributes:**
 
-    - `ids`: of items, in one list per tile.
-    - `begins`, `counts`: of the list of every tile, and of an empty one after the last tile.
+    - `ids`: ids of items, in one list per tile.
+    - `begins`, `counts`: begin and length of the list of every tile, and of an empty list after the
+      last tile.
     - `order`: the tiles, those with the longest lists first; a *chunk* is `lanes` of them.
-    - `needed`: capacity needed over planned; above 1 the lists are incomplete.
-    - `items`: their number. Static.
+    - `needed`: needed capacity divided by planned capacity; above 1 the lists are incomplete.
+    - `items`: number of items. Static.
     """
 
     ids: Int[Array, " pairs"]

@@ -19,15 +19,16 @@ MERGED_COUNTS = 8, 16, 32  # consecutive splats that are near each other in the 
 
 
 def merge_splats(splats: Splats, count: int) -> Splats:
-    """Merge each `count` consecutive splats into one disc for each side of the surface: at the
-    mean of their centers over area, with their mean normal and the sum of their areas.
+    """Merge every `count` consecutive splats into one disc for each side of the surface.
+
+    A disc has the area-weighted mean center, the mean normal, and the total area of its splats.
 
     Splats of a group that face away from its first one belong to the other side. A disc without
     splats has no extent and no normal.
 
     **Arguments:**
 
-    - `splats`: in a compact order, a multiple of `count`. Differentiable; the sides are constants.
+    - `splats`: a multiple of `count`, in a compact order. Differentiable; the sides are constants.
 
     **Returns:** twice as many discs as there are groups, without maps.
     """
@@ -169,7 +170,7 @@ class Sightlines(eqx.Module):
 
         **Arguments:**
 
-        - `exitance`: of the first splat of each group of this device. Differentiable.
+        - `exitance`: exitance of the first splat of each group of this device. Differentiable.
         - `normals`: unit, or zero for padding. Differentiable.
         """
         everywhere = combination.gather(exitance.T)

@@ -111,7 +111,7 @@ class PixelSums(eqx.Module):
 
     **Attributes:**
 
-    - `rows`: sums of weights times attributes, followed by those of weights times the nearness of
+    - `rows`: sums of weights times attributes, followed by sums of weights times the nearness of
       the ray's hits with the planes of the splats.
     - `weights`: sums of weights.
     """
@@ -127,8 +127,8 @@ class FragmentSums(eqx.Module):
 
     - `tiles`: the tile at each place, first of the front, then of the surface behind; the number of
       tiles in an empty place.
-    - `sums`: of each place.
-    - `needed`: capacity needed over planned; above 1 the sums are incomplete.
+    - `sums`: the sums of each place.
+    - `needed`: needed capacity divided by planned capacity; above 1 the sums are incomplete.
     - `front`: the number of places of the front. Static.
     """
 
@@ -150,7 +150,7 @@ class AbstractRasterPlan(eqx.Module):
         self, splats: Splats, view: AbstractView
     ) -> tuple[Int[Array, " chosen"], Float[Array, ""]]:
         """List the splats that a view may see, in order, padded by the number of splats. Also
-        compute the capacity needed over planned.
+        compute the needed capacity divided by the planned capacity.
         """
         every = jnp.arange(splats.count, dtype=jnp.int32)
         return every, jnp.zeros((), splats.centers.dtype)
@@ -178,7 +178,8 @@ class AbstractRasterPlan(eqx.Module):
 
         **Arguments:**
 
-        - `splats`, `attributes`: those of this device, at least one. Differentiable.
+        - `splats`, `attributes`: the splats of this device, at least one, and their attributes.
+          Differentiable.
         - `combination`: combines the parts of the splats of several devices.
 
         **Returns:** the sums over the splats of this device.
@@ -208,8 +209,8 @@ class AbstractRasterizer(eqx.Module):
 
         **Arguments:**
 
-        - `parts`: of one size; one for each device.
-        - `views`: of one size.
+        - `parts`: parts of one size; one for each device.
+        - `views`: views of one size.
         """
 
     def for_shadows(self) -> "AbstractRasterizer":

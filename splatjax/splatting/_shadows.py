@@ -33,17 +33,19 @@ class ShadowSettings(eqx.Module):
     **Attributes:**
 
     - `resolution`: pixels along a side of each map, at most.
-    - `pixels_per_spacing`: a map has no more pixels than so many per spacing of the splats, rounded
-      up to one of two sizes per octave, and not fewer than 64. Finer ones show discs and not the
-      body. `inf` for the full resolution.
-    - `bias`: a surface less than this distance behind that of the map is fully lit, so that a
-      surface does not shadow itself. The unit is the reach of the splat in the map: the root of the
-      sum of the squares of its radius and of a pixel's diagonal.
+    - `pixels_per_spacing`: limits the map to this many pixels per spacing of the splats, because a
+      finer map would show single discs instead of the body. The resulting size is rounded up, to
+      one of two sizes per octave, and is at least 64. `inf` for the full resolution.
+    - `bias`: a surface less than this distance behind the surface of the map is fully lit, so that
+      a surface does not shadow itself. The unit is the reach of the splat in the map: the root of
+      the sum of the squares of its radius and of a pixel's diagonal.
     - `softness`: the number of further reaches over which the light fades, so that shadows have
-      gradients in depth. Across the edge of a shadow, light fades over about two pixels of the map.
+      gradients with respect to depth. Across the edge of a shadow, light fades over about two
+      pixels of the map.
     - `compared`: the side of the square of pixels with which a splat is compared, 2 or 3.
-    - `merged_spacing`: the largest spacing of merged discs, in pixels of the map; 0 to merge none.
-      A disc has eight to 32 splats, so splats of more than a third of this spacing are not merged.
+    - `merged_spacing`: neighboring splats are merged, 8, 16 or 32 to a disc, as long as the discs
+      are at most this many pixels of the map apart; 0 merges none. Splats that are already farther
+      apart than about a third of this are not merged.
     - `largest_slope`: the slope up to which the receiver's plane is continued from pixel to pixel
       of the map. On heads, 4 leaves steps at grazing light, and more than 8 has no effect.
     """

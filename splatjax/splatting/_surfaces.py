@@ -32,7 +32,7 @@ def blend_fragments(
     r"""Blend the fragments of each pixel, `c(f) = sum_i w_i c_i / sum_i w_i` (Eq. 1); 0 without
     fragments.
 
-    **Arguments:** `sums`, `weights`: of `w_i c_i` and of `w_i`. Differentiable.
+    **Arguments:** `sums`, `weights`: sums of `w_i c_i` and of `w_i`. Differentiable.
 
     **Source:** Kim et al. 2010, Eq. 1.
     """
@@ -74,7 +74,7 @@ class Surface(eqx.Module):
 
     - `attributes`: blended; 0 where there is no surface.
     - `depth`: mm along the view's forward axis; 1 where there is no surface.
-    - `covered`: where there is one.
+    - `covered`: whether there is a surface.
     """
 
     attributes: Float[Array, "tiles attributes pixels"]
@@ -99,10 +99,10 @@ class VisibleSurfaces(eqx.Module):
 
     - `tiles`: the tile of each place of this device; the number of tiles in an empty place.
     - `in_front`: whether a place belongs to the surface in front, or to the one behind.
-    - `sums`: of the fragments.
+    - `sums`: sums over the fragments.
     - `share`: the fraction of its pixel that each surface covers.
-    - `needed`: capacity needed over planned. Above 1 every picture is NaN, and so are its
-      derivatives.
+    - `needed`: needed capacity divided by planned capacity. Above 1 every picture and its
+      derivatives are NaN.
     """
 
     view: AbstractView
@@ -142,7 +142,7 @@ class VisibleSurfaces(eqx.Module):
 
     @property
     def overflow(self) -> Float[Array, ""]:
-        """The needed over the planned capacity if that does not suffice, else 0."""
+        """The needed capacity divided by the planned capacity if that does not suffice, else 0."""
         return jnp.where(self.needed <= 1, 0.0, self.needed)
 
     @property
@@ -213,7 +213,7 @@ def visible_surfaces(
     - `splats`: differentiable; the choice of fragments is not.
     - `attributes`: one row per attribute. Differentiable.
     - `view`: differentiable.
-    - `plan`: from an `AbstractRasterizer`.
+    - `plan`: a plan from an `AbstractRasterizer`.
 
     **Returns:** the surfaces; if the capacity of the plan is exceeded, `needed` is above 1 and
     every picture is NaN.

@@ -211,7 +211,7 @@ def sum_parts(
     **Arguments:**
 
     - `parts`: each call iterates over the parts on this device, and gives the sweep of every view.
-    - `capacities`: of each view.
+    - `capacities`: capacity of each view.
 
     **Returns:** for each view the sums on this device, and their spans.
     """

@@ -38,8 +38,8 @@ class SplattingSettings(eqx.Module):
 
     **Attributes:**
 
-    - `filter_radius`: of the screen filter, pixels, positive. At the root of 2, the sum of a small
-      splat's weights over the pixels is independent of its position between them, to 4%.
+    - `filter_radius`: radius of the screen filter, pixels, positive. At the root of 2, the sum of a
+      small splat's weights over the pixels is independent of its position between them, to 4%.
     - `epsilon_z`: fragments within this many radii behind the front belong to it (3.1).
     - `largest_slope`: slanted splats have epsilon lengthened by `1 / cos`, up to this factor.
     - `full_coverage`: weight sum from which on a surface covers a pixel beside the background, at
@@ -82,7 +82,7 @@ class SplattingSettings(eqx.Module):
         **Arguments:**
 
         - `unevenness`: see `splatjax.diffusion.unevenness`.
-        - `discs`: the sum of the squared radii of all splats over that of their areas.
+        - `discs`: the sum of the squared radii of all splats divided by the sum of their areas.
         """
         if self.full_coverage is not None:
             return self

@@ -105,8 +105,8 @@ def monte_carlo(
     flights: int = _FLIGHTS,
     progress: Callable[[int, int], None] | None = None,
 ) -> MonteCarlo:
-    r"""Walk photons through layers and count where they leave, without the limits of diffusion on
-    thickness and absorption.
+    r"""Compute a profile by random walks of photons through layers: the reference for all other
+    models, for any thickness and absorption.
 
     Photons fly from one scattering event to the next; absorption reduces their weight; interfaces
     reflect or refract them by Fresnel's formulas. Channels that differ only in absorption, or only
@@ -117,24 +117,25 @@ def monte_carlo(
 
     **Arguments:**
 
-    - `layers`: from the top; only the lowest may be infinite.
+    - `layers`: the layers, from the top; only the lowest may be infinite.
     - `photons`: number of photons for each walk; errors decrease with its root.
-    - `key`: of `jax.random`; the same key gives the same numbers.
-    - `edges`: of the rings, mm; ascending. By default 128 rings whose widths grow in proportion,
-      from a fiftieth of a mean free path.
+    - `key`: a key of `jax.random`; the same key gives the same numbers.
+    - `edges`: edges of the rings, mm; ascending. By default 128 rings whose widths grow in
+      proportion, from a fiftieth of a mean free path.
     - `incidence`: `NormalIncidence()` or `DiffuseIncidence()`.
     - `g`: mean cosine of Henyey and Greenstein's phase function, between -1 and 1; one for all
       layers, or one for each. `sigma_s = sigma_s' / (1 - g)`.
     - `eta_above`, `eta_below`: indices of the neighbors relative to air.
-    - `flights`: largest number of flights from event to event for each photon; its power after them
-      is `unfinished`.
-    - `progress`: called from time to time with the number of photons done and that of all.
+    - `flights`: number of flights, from one event to the next, after which a photon is given up.
+      Its remaining power is counted in `unfinished`.
+    - `progress`: called from time to time with the number of finished photons, and the number of
+      all.
 
     **Returns:** a `MonteCarlo`.
 
     **Raises:** `ValueError` for no scattering layer, for numbers of channels that differ, for an
-    infinite layer above another, for a number of photons below 2 or not below 2^30, for a `g` out
-    of its range, for edges that do not ascend, and for derivatives in other arguments.
+    infinite layer above another, for fewer than 2 photons, or 2^30 and more, for a `g` out of its
+    range, for edges that do not ascend, and for derivatives with respect to other arguments.
 
     **Source:** Wang, Jacques and Zheng 1995 (MCML); one walk for many absorptions: Kienle and
     Patterson 1996; path weights: Hayakawa et al. 2001.

@@ -116,18 +116,19 @@ class SampleMean(eqx.Module):
 
 
 class MonteCarlo(eqx.Module):
-    r"""The fate of the light that entered, by counting photons; powers are fractions of it.
+    r"""The fate of the light that entered, by counting photons; powers are fractions of the
+    entering light.
 
     **Attributes:**
 
-    - `edges`: of the rings, mm.
+    - `edges`: edges of the rings, mm.
     - `specular`: the fraction of the arriving light that the surface reflects; [channels].
-    - `reflected`, `transmitted`: the light that leaves above and below through each ring, by the
-      area of the ring; 1/mm^2, [rings, channels].
+    - `reflected`, `transmitted`: the light that leaves above and below through each ring, divided
+      by the area of the ring; 1/mm^2, [rings, channels].
     - `total_reflectance`, `total_transmittance`: all light that leaves, at any distance;
       [channels].
-    - `absorbed`: in each layer; [layers, channels].
-    - `unfinished`: of photons after their last allowed flight; [channels].
+    - `absorbed`: the light absorbed in each layer; [layers, channels].
+    - `unfinished`: the power of photons after their last allowed flight; [channels].
     """
 
     edges: Float[Array, " edges"]

@@ -31,14 +31,14 @@ class AbstractIncidence(eqx.Module):
         xi_angle: Float[Array, " photons"],
         eta: Float[Array, " two"],
     ) -> tuple[Direction, Float[Array, " photons"]]:
-        """Draw directions inside and weights, of mean 1, by uniform numbers and the indices outside
-        and inside.
+        """Draw directions inside, and weights of mean 1, from uniform numbers and the indices
+        outside and inside.
         """
 
     @abc.abstractmethod
     def reflected(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        """Compute the fraction of the arriving power that does not enter, by the index inside over
-        outside.
+        """Compute the fraction of the arriving power that does not enter, by the index inside
+        divided by the index outside.
         """
 
 
