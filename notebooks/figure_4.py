@@ -43,10 +43,13 @@ skin = sj.load_material("skin").white()
 
 # %% [markdown]
 # Top: the layers, the narrowest first. Bottom: the contribution of each to the picture, by its
-# weights for red, green and blue. Blue and green stay near their entry, red travels farther.
+# weights for red, green and blue. Blue and green stay near their entry, red travels farther. The
+# layers are the means of the paper; the default kernel would make curved parts of the wide layers
+# brighter (`docs/bodies.md`).
 
 # %%
-frame = sj.render(sj.Scene(body, lights, skin), camera)
+settings = sj.RenderSettings(kernel=sj.diffusion.PlainMean())
+frame = sj.render(sj.Scene(body, lights, skin), camera, settings)
 layers, weights = np.asarray(frame.layers), np.asarray(frame.weights)
 titles = [f"{float(variance) ** 0.5:.2g} mm" for variance in skin.gaussians.variances]
 plot_pictures([layers, weights[:, None, None] * layers], titles, ["layer", "what it adds"])
