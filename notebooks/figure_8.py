@@ -52,7 +52,8 @@ skin = sj.load_material("skin").white()
 # around middle gray.
 
 # %%
-ours = sj.render(sj.Scene(splats, (light,), skin), camera)
+settings = sj.RenderSettings(kernel=sj.diffusion.PlainMean())  # that of texture space
+ours = sj.render(sj.Scene(splats, (light,), skin), camera, settings)
 finer = replace(camera, width=2 * SIZE, height=2 * SIZE)
 theirs = baselines.render_texture_space(triangles, (light,), skin, finer).frame
 beauty, coverage = (

@@ -62,12 +62,6 @@ def degrees(a, b) -> np.ndarray:
 
 
 smooth = ball()
-as_given = sj.inverse.NormalOffsets(
-    step=1.0, smoothness=1e-3, deviation=1.0
-)  # no blur: the heights themselves
-bumpy = as_given.moved(
-    smooth, jnp.asarray(heights(np.asarray(smooth.normals)), jnp.float32), as_given.prepared(smooth)
-)
 camera = sj.Camera.look_at(
     jnp.asarray([0.0, 0.0, 60.0]), jnp.zeros(3), fov=22.0, width=SIZE, height=SIZE
 )
@@ -76,6 +70,13 @@ lamps = [
     sj.DirectionalLight(jnp.asarray(way), jnp.full(3, np.pi), cast_shadows=False)
     for way in directions
 ]
+# No blur: the heights themselves.
+as_given = sj.inverse.NormalOffsets(step=1.0, smoothness=1e-3, deviation=1.0)
+bumpy = as_given.moved(
+    sj.inverse.PicturedScene(smooth, camera, tuple(lamps)),
+    jnp.asarray(heights(np.asarray(smooth.normals)), jnp.float32),
+    as_given.prepared(smooth),
+).splats
 weights = jnp.asarray([[0.35, 0.35, 0.4], [0.3, 0.25, 0.2], [0.2, 0.15, 0.1]])
 
 

@@ -21,6 +21,7 @@ from ._observation import (
     Candidate as Candidate,
     default_candidates as default_candidates,
     Observation as Observation,
+    PicturedScene as PicturedScene,
 )
 from ._offsets import NormalOffsets as NormalOffsets
 from ._parameter_map import ParameterMap as ParameterMap
