@@ -38,7 +38,7 @@ layers = [sj.SumOfGaussians(skin.variances[k : k + 1], skin.weights[k : k + 1]) 
 shades = LogNorm(*(float(layers[0](jnp.zeros(1)).mean()) * np.asarray([1e-5, 1])))
 
 figure = Figure(figsize=(10.6, 6.2), dpi=150, layout="constrained")
-above, below = figure.subfigures(2, 1, height_ratios=(1, 1.9))
+above, below = figure.subfigures(2, 1, height_ratios=(1, 1.9))  # ty: ignore[not-iterable]
 for axes, layer in zip(above.subplots(1, 6), layers, strict=True):
     spread = layer(jnp.hypot(axis[:, None], axis)).mean(axis=2)
     axes.imshow(np.maximum(spread, 1e-30), cmap="magma", norm=shades)

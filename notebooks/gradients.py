@@ -77,7 +77,8 @@ with jax.enable_x64(True):
     @jax.jit
     @jax.value_and_grad
     def loss_and_gradient(inputs):
-        return jnp.mean(sj.diffuse_irradiance(*inputs, lens, plan=plan) * pattern)
+        scene, irradiance = inputs
+        return jnp.mean(sj.diffuse_irradiance(scene, irradiance, lens, plan=plan) * pattern)
 
     _, gradient = loss_and_gradient(inputs)
     parts = {

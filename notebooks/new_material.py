@@ -95,9 +95,9 @@ print("total reflectance, stone ", totals[0].round(3))
 print("                  glazed ", totals[1].round(3))
 
 # %%
-assert np.max(np.asarray(fitted.error)) < 0.0201
+assert jnp.max(fitted.error) < 0.0201
 assert np.max(np.asarray(by_count.error)[count - 2]) > 0.02
 assert np.max(np.abs(np.asarray(fitted.energy_error))) < 1e-12
-assert np.max(np.asarray(fitted_glaze.error)) < 0.03
+assert jnp.max(fitted_glaze.error) < 0.03
 assert same
 assert np.all(totals[1][1:] < totals[0][1:])

@@ -19,6 +19,7 @@
 
 # %%
 # %matplotlib inline
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -46,7 +47,7 @@ pictures = [
 ]
 figure = Figure(figsize=(12, 2))
 ax = figure.add_axes((0, 0, 1, 1), frameon=False, xticks=[], yticks=[])
-ax.imshow(np.clip(np.concatenate(pictures, axis=1), 0, 1) ** (1 / 2.2))
+ax.imshow(jnp.clip(jnp.concatenate(pictures, axis=1), 0, 1) ** (1 / 2.2))
 figure  # noqa: B018
 
 # %% [markdown]

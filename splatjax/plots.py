@@ -164,7 +164,7 @@ def plot_error_by_count(by_count: ErrorByCount, *, title: str | None = None) -> 
 
 
 def plot_pictures(
-    rows: Sequence[Sequence[ArrayLike]],
+    rows: Sequence[Sequence[ArrayLike] | np.ndarray],
     titles: Sequence[str],
     names: Sequence[str] | None = None,
     *,

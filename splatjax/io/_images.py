@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import OpenEXR  # ty: ignore[import-not-found]
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from PIL import Image
 
 from splatjax._display import linear_to_srgb as linear_to_srgb, png_of, to_display
@@ -108,7 +108,9 @@ def srgb_to_linear(encoded: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
 
 def write_png(
     path: StrPath,
-    picture: Frame | Float[np.ndarray, "height width channels"],
+    picture: Frame
+    | Float[Array, "height width channels"]
+    | Float[np.ndarray, "height width channels"],
     *,
     exposure: float = 0.0,
 ) -> None:

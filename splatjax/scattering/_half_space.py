@@ -172,7 +172,9 @@ class HalfSpace(eqx.Module):
         """Compute a fraction by reduced albedo, index, g, and the cover's albedo and depth."""
         medium, cover = self.medium, self.cover
         layer = cover and (cover.medium.albedo_prime, cover.medium.sigma_t_prime * cover.thickness)
-        return jax.vmap(fraction)(medium.albedo_prime, medium.eta, self.g, layer)
+        # One after the other: with all at once, XLA never ends a program in which a fit follows.
+        inputs = medium.albedo_prime, medium.eta, self.g, layer
+        return jax.lax.map(lambda channel: fraction(*channel), inputs)
 
     @jit_unless_traced
     def angular_law(self, separate: Float[Array, "angles channels"] | None = None) -> AngularLaw:

@@ -148,13 +148,8 @@ def _pigment_absorption(
     }
 
 
-def _amount(default: float, most: float = 1.0, least: float = 0.0, unit: str = "") -> Any:
-    requirement = f"between {least:g} and {most:g}{unit}"
-    return eqx.field(
-        converter=numbers,
-        default=default,
-        metadata=valid(requirement, lambda x: (x >= least) & (x <= most)),
-    )
+def _between(least: float, most: float, unit: str = "") -> dict[str, Any]:
+    return valid(f"between {least:g} and {most:g}{unit}", lambda x: (x >= least) & (x <= most))
 
 
 @record
@@ -188,19 +183,41 @@ class Skin(eqx.Module):
     vessels: Van Veen, Verkruysse and Sterenborg 2002.
     """
 
-    melanin: Float[Array, ""] = _amount(0.02)
-    blood: Float[Array, ""] = _amount(0.01)
-    oxygenation: Float[Array, ""] = _amount(0.75)
-    eumelanin: Float[Array, ""] = _amount(0.74)
-    carotene: Float[Array, ""] = _amount(7e-5, 0.1, unit=" (g/l)")
-    bilirubin: Float[Array, ""] = _amount(0.0, 1.0, unit=" (g/l)")
-    water: Float[Array, ""] = _amount(0.65)
-    vessel_radius: Float[Array, ""] = _amount(0.02, 1.0, unit=" (mm)")
-    thickness: Float[Array, ""] = _amount(0.08, 2.0, unit=" (mm)")
-    scattering: Float[Array, ""] = _amount(4.6, 100.0, 0.1, " (1/mm)")
-    scattering_power: Float[Array, ""] = _amount(1.421, 4.0)
-    eta: Float[Array, ""] = _amount(1.4, 3.0, 1.0)
-    g: Float[Array, ""] = _amount(0.8, 0.95, -0.95)
+    melanin: Float[Array, ""] = eqx.field(
+        converter=numbers, default=0.02, metadata=_between(0.0, 1.0)
+    )
+    blood: Float[Array, ""] = eqx.field(
+        converter=numbers, default=0.01, metadata=_between(0.0, 1.0)
+    )
+    oxygenation: Float[Array, ""] = eqx.field(
+        converter=numbers, default=0.75, metadata=_between(0.0, 1.0)
+    )
+    eumelanin: Float[Array, ""] = eqx.field(
+        converter=numbers, default=0.74, metadata=_between(0.0, 1.0)
+    )
+    carotene: Float[Array, ""] = eqx.field(
+        converter=numbers, default=7e-5, metadata=_between(0.0, 0.1, " (g/l)")
+    )
+    bilirubin: Float[Array, ""] = eqx.field(
+        converter=numbers, default=0.0, metadata=_between(0.0, 1.0, " (g/l)")
+    )
+    water: Float[Array, ""] = eqx.field(
+        converter=numbers, default=0.65, metadata=_between(0.0, 1.0)
+    )
+    vessel_radius: Float[Array, ""] = eqx.field(
+        converter=numbers, default=0.02, metadata=_between(0.0, 1.0, " (mm)")
+    )
+    thickness: Float[Array, ""] = eqx.field(
+        converter=numbers, default=0.08, metadata=_between(0.0, 2.0, " (mm)")
+    )
+    scattering: Float[Array, ""] = eqx.field(
+        converter=numbers, default=4.6, metadata=_between(0.1, 100.0, " (1/mm)")
+    )
+    scattering_power: Float[Array, ""] = eqx.field(
+        converter=numbers, default=1.421, metadata=_between(0.0, 4.0)
+    )
+    eta: Float[Array, ""] = eqx.field(converter=numbers, default=1.4, metadata=_between(1.0, 3.0))
+    g: Float[Array, ""] = eqx.field(converter=numbers, default=0.8, metadata=_between(-0.95, 0.95))
     wavelengths: Float[Array, " channels"] = eqx.field(
         converter=numbers,
         default=tuple(range(400, 701, 10)),

@@ -95,11 +95,14 @@ class AbstractLight(eqx.Module):
 
 
 class AbstractLightSample(AbstractLight):
-    """A light from one point or direction. `cast_shadows` is static: a light without shadows needs
-    no shadow map.
-    """
+    """A light from one point or direction."""
 
-    cast_shadows: eqx.AbstractVar[bool]
+    # A field of every class. A property, since type checkers take an `AbstractVar` for the first
+    # argument of all.
+    @property
+    @abc.abstractmethod
+    def cast_shadows(self) -> bool:
+        """Whether the light has a shadow map. Static."""
 
     def samples(self) -> tuple["AbstractLightSample", ...]:
         """Return the light itself."""

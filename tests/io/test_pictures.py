@@ -117,7 +117,7 @@ def test_png_encodes_for_the_display(tmp_path, name):
     with Image.open(tmp_path / "a.png") as image:
         np.testing.assert_array_equal(np.asarray(image), expected)
     scale = [0.25] * 3 + [1] if name == "alpha" else 0.25
-    write_png(tmp_path / "b.png", picture * scale, exposure=2.0)
+    write_png(tmp_path / "b.png", jnp.asarray(picture * scale), exposure=2.0)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 

@@ -1,5 +1,7 @@
 """Where spectra become color: white, illuminants, the skin locus, and pictures of spectra."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import equinox as eqx
@@ -81,6 +83,25 @@ def test_a_projected_picture_is_the_picture_of_projected_weights():
     three = picture(np.pad(weights @ matrix, ((0, 0), (0, 28))))[..., :3]
     assert three.max() > 0.1
     np.testing.assert_allclose(picture(weights) @ matrix, three, atol=1e-5)
+
+
+@pytest.mark.once
+def test_pigments_to_weights_are_one_program():
+    """In a process of its own: where all channels were computed at once, it never ended."""
+    program = """
+import jax, numpy as np, splatjax as sj
+from splatjax.fitting import FixedTotalReflectance, TransportModel, fit_weights
+
+@jax.jit
+def fit(skin):
+    profile = skin.profile()
+    rule, held = TransportModel().rule, FixedTotalReflectance()
+    gaussians = fit_weights(profile, [0.01, 0.1, 1.0, 10.0], weights=held, rule=rule)
+    return gaussians.weights.sum(axis=0), profile.total_reflectance()
+
+np.testing.assert_allclose(*fit(sj.scattering.Skin()), rtol=1e-4)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=300)
 
 
 def test_an_unknown_illuminant_is_named():
