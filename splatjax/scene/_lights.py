@@ -5,7 +5,7 @@ surface towards the light.
 import abc
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
@@ -95,14 +95,19 @@ class AbstractLight(eqx.Module):
 
 
 class AbstractLightSample(AbstractLight):
-    """A light from one point or direction."""
+    """A light from one point or direction.
 
-    # A field of every class. A property, since type checkers take an `AbstractVar` for the first
-    # argument of all.
-    @property
-    @abc.abstractmethod
-    def cast_shadows(self) -> bool:
-        """Whether the light has a shadow map. Static."""
+    **Attributes:** (static)
+
+    - `cast_shadows`: whether the light has a shadow map.
+    """
+
+    if TYPE_CHECKING:  # to type checkers an abstract variable is the first argument of a class
+
+        @property
+        def cast_shadows(self) -> bool: ...
+    else:
+        cast_shadows: eqx.AbstractVar[bool]
 
     def samples(self) -> tuple["AbstractLightSample", ...]:
         """Return the light itself."""
