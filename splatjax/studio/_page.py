@@ -86,6 +86,7 @@ class Page:
         self._saves = list[tuple[str, Controls]]()
         self._observations = observations
         self._place = np.asarray([session.start.eye, session.start.target])
+        self._picked: tuple[int, int] | None = None
         self._image, self._joined = Image.new("RGB", (1, 1)), list[Any]()
         self._changed, self._closed = threading.Event(), threading.Event()
         with contextlib.redirect_stdout(io.StringIO()):  # it prints an address of its own
@@ -98,6 +99,7 @@ class Page:
         camera.position, camera.look_at = self._place
         camera.fov = float(np.radians(session.fov))
         self._add_controls(server.gui)
+        server.scene.on_click()(self._pick)
         server.on_client_connect(self._join)
         server.on_client_disconnect(
             lambda client: self._joined.remove(client) if client in self._joined else None
@@ -155,11 +157,12 @@ class Page:
                 }
             },
             legend={"show": False},
-            aspect=1.4,
+            aspect=1.8,
         )
         kinds = tuple(kind for kind in SUFFIXES if kind != "Python" or self._where[1])
         buttons = gui.add_button_group("save", kinds)
         buttons.on_click(lambda event: self._change(event.target.value))
+        self._pixel = gui.add_markdown("")
         if self._observations:
             self._add_search(gui)
 
@@ -230,11 +233,32 @@ class Page:
         else:  # its window may have another shape
             self._send(camera.client)
 
+    def _pick(self, event: Any) -> None:
+        """Choose the pixel at which a page was clicked; none beside the picture."""
+        camera, (x, y) = self._session.camera(self._session.start), event.screen_pos
+        width, height = _canvas(camera.width, camera.height, event.client)
+        column, row = int(x * width - (width - camera.width) // 2), int(y * height)
+        is_inside = 0 <= column < camera.width and row < camera.height
+        self._picked = (column, row) if is_inside else None
+        self._change()
+
+    def _take_apart(self, controls: Controls) -> str:
+        """Tabulate the parts of the chosen pixel."""
+        if self._picked is None:
+            return "click the picture for the parts of a pixel"
+        parts = self._session.pixel(controls, *self._picked)
+        names = channel_names(len(parts["radiance"]))
+        rows = [["pixel {}, {}".format(*self._picked), *names], ["---"] * (len(names) + 1)]
+        for name, values in parts.items():
+            rows.append([name, *(f"{value:.3g}" for value in values)])
+        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
     def _send(self, client: Any) -> None:
-        """Show the picture in the middle of a window of any shape."""
-        (width, height), aspect = self._image.size, client.camera.aspect
-        size = max(width, round(height * aspect)), max(height, round(width / aspect))
-        canvas = np.asarray(ImageOps.pad(self._image, size))
+        """Show the picture in a window of any shape: in the middle, or at the top, above the
+        controls.
+        """
+        size = _canvas(*self._image.size, client)
+        canvas = np.asarray(ImageOps.pad(self._image, size, centering=(0.5, 0.0)))
         client.scene.set_background_image(canvas, "jpeg", jpeg_quality=_QUALITY)
 
     def _show(self, image: np.ndarray) -> None:
@@ -267,6 +291,7 @@ class Page:
             return ""
         picture = session.picture(controls)
         self._show(picture)
+        self._pixel.content = self._take_apart(controls)
         if self._observations and np.allclose(
             self._place, [session.start.eye, session.start.target], rtol=_NEAR
         ):
@@ -275,3 +300,9 @@ class Page:
             kind, saved = self._saves.pop(0)
             written += save(session, saved, *self._where, kind)
         return f"saved {', '.join(path.name for path in written)}" if written else ""
+
+
+def _canvas(width: int, height: int, client: Any) -> tuple[int, int]:
+    """Return the size of the least canvas around a picture that has the shape of a window."""
+    aspect = client.camera.aspect
+    return max(width, round(height * aspect)), max(height, round(width / aspect))

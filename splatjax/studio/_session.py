@@ -137,6 +137,29 @@ class Session:
         plan, light = self._plan(body, controls), self._light(body, controls)
         return render(scene, camera, plan=plan, light=light)
 
+    def pixel(
+        self, controls: Controls, column: int, row: int
+    ) -> dict[str, Float[np.ndarray, " channels"]]:
+        """Take a pixel of the picture apart.
+
+        **Returns:** per channel, its radiance, its highlight, and the light that each Gaussian
+        spreads, by its width; where there are coefficients, also the change of the radiance with
+        the logarithms of absorption and of scattering, for held variances.
+        """
+        basis, gaussians = self._basis(self._full, controls), self._gaussians(controls)
+        place, medium = (row, column), self._medium(controls)
+        light = _light_of_gaussians(basis, gaussians, place)
+        highlight = controls.specular * basis.specular[place]
+        parts = {"radiance": jnp.sum(light, axis=0) + highlight, "highlight": highlight}
+        widths = np.sqrt(gaussians.variances).tolist()
+        parts |= {f"{width:.2g} mm": of for width, of in zip(widths, light, strict=True)}
+        if medium is not None:
+            inputs = self.model, medium, self._variances, self._has_color
+            changes = _changes_with_coefficients(*inputs, basis, place)
+            names = "per ln absorption", "per ln scattering"
+            parts |= {name: controls.scale * of for name, of in zip(names, changes, strict=True)}
+        return {name: np.asarray(values, np.float64) for name, values in parts.items()}
+
     def scene(self, controls: Controls, body: _Body | None = None, **surface: float) -> Scene:
         """Return the scene of a state: after `picture`, that of the picture."""
         surface = {name: getattr(controls, name) for name in SURFACE} | surface
@@ -271,6 +294,42 @@ def _blend(
     basis: DiffusionBasis, gaussians: SumOfGaussians, shares: Float[Array, "2"]
 ) -> Float[Array, "height width channels"]:
     return shares[0] * (basis.beauty(gaussians) - basis.specular) + shares[1] * basis.specular
+
+
+@eqx.filter_jit
+def _light_of_gaussians(
+    basis: DiffusionBasis, gaussians: SumOfGaussians, place: tuple[int, int]
+) -> Float[Array, "gaussians channels"]:
+    """Compute what each Gaussian adds to the radiance of the pixel of a row and a column."""
+    layers, _ = basis.light.weigh(gaussians, jnp.zeros_like(gaussians.weights[0]))
+    radiance = gaussians.weights[:, :, None] * layers * basis.pixel_radiance_per_exitance[None]
+    row, column = place
+    at_pixel = basis.pixels == row * basis.specular.shape[1] + column
+    return jnp.sum(jnp.where(at_pixel, radiance, 0.0), axis=2)
+
+
+@eqx.filter_jit
+def _changes_with_coefficients(
+    model: _fitting.AbstractModel,
+    medium: Medium,
+    variances: Float[Array, " gaussians"],
+    has_color: bool,
+    basis: DiffusionBasis,
+    place: tuple[int, int],
+) -> list[Float[Array, " channels"]]:
+    """Differentiate the radiance of a pixel with respect to the logarithms of absorption and of
+    scattering. No channel depends on the coefficients of another.
+    """
+
+    def radiance(sigma_a, sigma_s_prime):
+        gaussians = _fit_weights(model, Medium(sigma_a, sigma_s_prime, medium.eta), variances)
+        gaussians = gaussians if has_color else gaussians.white()
+        return jnp.sum(_light_of_gaussians(basis, gaussians, place), axis=0)
+
+    coefficients = medium.sigma_a, medium.sigma_s_prime
+    none = jnp.zeros_like(medium.sigma_a)
+    directions = (medium.sigma_a, none), (none, medium.sigma_s_prime)
+    return [jax.jvp(radiance, coefficients, along)[1] for along in directions]
 
 
 @eqx.filter_jit

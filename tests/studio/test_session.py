@@ -93,6 +93,28 @@ def test_coefficients_are_fitted_as_a_material_is(studio, states):
     assert [row.shape for row in rows] == [radii.shape] * 6
 
 
+def test_a_pixel_is_the_sum_of_its_parts(studio, states):
+    """Its changes with the coefficients are differences of pictures of held variances."""
+    controls = states["absorption"]
+    studio.picture(controls)
+    frame, column, row = studio.frame(controls), 25, 15
+    radiance, highlight, *rest = studio.pixel(controls, column, row).values()
+    assert frame.coverage[row, column] == 1
+    assert radiance.min() > 0.1
+    np.testing.assert_allclose(radiance, frame.beauty[row, column], rtol=1e-4)
+    np.testing.assert_allclose(highlight, frame.specular[row, column], rtol=1e-4)
+    light = frame.weights * frame.layers[:, row, column]
+    np.testing.assert_allclose(rest[:-2], light, rtol=1e-3, atol=1e-5)
+    for field, change in zip(("sigma_a", "sigma_s_prime"), rest[-2:], strict=True):
+        ends = [
+            studio.pixel(with_(controls, **{field: tuple(factor * x for x in value)}), column, row)
+            for value in [getattr(controls, field)]
+            for factor in (np.exp(-0.01), np.exp(0.01))
+        ]
+        difference = (ends[1]["radiance"] - ends[0]["radiance"]) / 0.02
+        np.testing.assert_allclose(change, difference, rtol=0.02, atol=1e-4)
+
+
 def test_many_changes_compile_nothing_and_keep_nothing(studio, compiled):
     def change(i: int) -> None:
         factor, moved = 1.5 + 0.3 * np.sin(i), {"scale": 0.5 + 0.4 * np.cos(i)}
@@ -243,7 +265,7 @@ def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp
 
 
 @VISER
-def test_a_browser_orbits_drags_and_saves(page, tmp_path):
+def test_a_browser_picks_drags_orbits_and_saves(page, tmp_path):
     playwright = pytest.importorskip("playwright.sync_api")
     chromium = shutil.which("chromium")
     if chromium is None:
@@ -253,15 +275,35 @@ def test_a_browser_orbits_drags_and_saves(page, tmp_path):
         flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         browser = driver.chromium.launch(executable_path=chromium, args=flags)
         window = browser.new_page(viewport={"width": 900, "height": 500})
+
+        def shows_the_picture() -> None:
+            wait_until(lambda: page._image.size == (SIDE, SIDE) and page._status.content == "")
+            window.wait_for_timeout(3000)
+            picture = Image.open(io.BytesIO(window.screenshot())).convert("RGB")
+            middle = picture.crop((200, 0, 700, 500)).resize((SIDE, SIDE), Image.Resampling.BOX)
+            seen, made = (np.asarray(each, float) for each in (middle, page._image))
+            shown = np.abs(seen - made)[:, 11:34]  # between a note of viser and the panel
+            assert shown.mean() < SHOWN
+
         window.goto(page.url)
         window.wait_for_selector("text=turn lights")
-        wait_until(lambda: page._image.size == (SIDE, SIDE) and page._status.content == "")
-        window.wait_for_timeout(3000)
-        picture = Image.open(io.BytesIO(window.screenshot())).convert("RGB")
-        middle = picture.crop((200, 0, 700, 500)).resize((SIDE, SIDE), Image.Resampling.BOX)
-        seen, made = (np.asarray(each, float) for each in (middle, page._image))
-        shown = np.abs(seen - made)[:, 11:34]  # between a note of viser and the panel
-        assert shown.mean() < SHOWN
+        shows_the_picture()
+        window.mouse.click(450, 200)
+        wait_until(lambda: "| radiance |" in page._pixel.content)
+        assert page._pixel.content.startswith("| pixel 24, 19 | red | green | blue |")
+        for folder in ("absorption", "scattering"):
+            window.get_by_text(f"{folder}, by powers of 2").click()
+        sliders = window.get_by_role("slider")
+        moving = {name: handle.value for name, handle in page._handles.items() if name != "layer"}
+        wait_until(lambda: sliders.count() == len(moving))
+        for number in range(len(moving)):
+            sliders.nth(number).focus()
+            window.keyboard.press("ArrowLeft")
+            window.wait_for_timeout(100)
+        wait_until(lambda: all(page._handles[name].value < moving[name] for name in moving))
+        window.reload()
+        window.wait_for_selector("text=turn lights")
+        shows_the_picture()
         window.mouse.move(200, 250)
         window.mouse.down()
         window.mouse.move(260, 250, steps=5)
