@@ -193,11 +193,15 @@ def _table(values: dict[str, Any], home: str = "") -> str:
 
 
 def _public(module: str) -> dict[str, Any]:
-    """Return the public functions and classes of a module, in the order of its exports."""
+    """Return the public functions and classes of a module, in the order of its exports: a package
+    exports what it imports.
+    """
+    imported = importlib.import_module(module)
+    home = "splatjax" if hasattr(imported, "__path__") else module
     return {
         name: value
-        for name, value in vars(importlib.import_module(module)).items()
-        if callable(value) and name[0] != "_" and value.__module__.startswith("splatjax")
+        for name, value in vars(imported).items()
+        if callable(value) and name[0] != "_" and value.__module__.startswith(home)
     }
 
 
