@@ -43,7 +43,10 @@ splats = sample_mesh(mesh, 40_000, textures=textures).scaled(SCALE)
 low, high = jnp.min(splats.centers, axis=0), jnp.max(splats.centers, axis=0)
 eye = (low + high) / 2 + (high[1] - low[1]) * jnp.asarray([1.3, 0.1, 2.7])
 camera = sj.Camera.look_at(eye, (low + high) / 2, fov=22.0, width=SIZE, height=SIZE)
-light = sj.DirectionalLight(jnp.asarray([0.5, -0.4, -0.75]), jnp.full(3, jnp.pi))
+lights = (
+    sj.DirectionalLight(jnp.asarray([0.5, -0.4, -0.75]), jnp.full(3, jnp.pi)),
+    sj.DirectionalLight(jnp.asarray([-0.7, -0.2, -0.7]), jnp.full(3, 0.3), cast_shadows=False),
+)
 skin = sj.load_material("skin").white()
 
 # %% [markdown]
@@ -53,9 +56,9 @@ skin = sj.load_material("skin").white()
 
 # %%
 settings = sj.RenderSettings(kernel=sj.diffusion.PlainMean())  # that of texture space
-ours = sj.render(sj.Scene(splats, (light,), skin), camera, settings)
+ours = sj.render(sj.Scene(splats, lights, skin), camera, settings)
 finer = replace(camera, width=2 * SIZE, height=2 * SIZE)
-theirs = baselines.render_texture_space(triangles, (light,), skin, finer).frame
+theirs = baselines.render_texture_space(triangles, lights, skin, finer).frame
 beauty, coverage = (
     np.asarray(layer).reshape(SIZE, 2, SIZE, 2, -1).mean(axis=(1, 3))
     for layer in (theirs.beauty, theirs.coverage)
