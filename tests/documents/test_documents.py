@@ -234,9 +234,13 @@ def test_every_equation_and_pass_has_its_row(row):
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=name)
-def test_links_lead_to_files(page):
-    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+def test_links_and_named_files_lead_to_files(page):
+    text = page.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
         assert target.startswith("https://") or (page.parent / target).exists(), target
+    if page.name not in ("CHANGELOG.md", "CONTRIBUTING.md"):  # files of the past, and yours
+        for named in re.findall(r"`((?:splatjax|tests|tools|benchmarks|notebooks)/\S+\.py)`", text):
+            assert (ROOT / named).is_file(), named
 
 
 WITH_PROGRAMS = [pytest.param(page, id=name(page)) for page in PAGES if fences(page, "python")]
