@@ -69,7 +69,7 @@ GROUPS = {
 }
 _LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")
 _NOTEBOOK = re.compile(r"^(notebooks/.*)\.py$")
-_MATHS = re.compile(r"\$([^$\n]+)\$")
+_MATHS = re.compile(r"\$([^$]+)\$")
 _NAME = re.compile(r"(?<!\[)`(splatjax(?:\.\w+)+)`(?!\])")
 
 
@@ -137,7 +137,7 @@ def _notebook(path: Path) -> tuple[str, dict[str, bytes]]:
     for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
         source = "".join(cell["source"])
         if cell["cell_type"] == "markdown":  # browsers show MathML without a script
-            parts.append(_MATHS.sub(lambda m: convert(m[1]), source))
+            parts.append(_MATHS.sub(lambda m: f"<span>{convert(m[1])}</span>", source))
             continue
         code = re.sub(r"^%.*\n?|  # noqa: B018$", "", source, flags=re.MULTILINE)
         parts.append(f"```python\n{code}\n```")

@@ -243,6 +243,24 @@ def test_links_and_named_files_lead_to_files(page):
             assert (ROOT / named).is_file(), named
 
 
+def test_the_readme_measures_as_its_pages_do():
+    """Every number of its table against others stands on the page that the row, or one above it,
+    links to; there it may have more digits.
+    """
+    number = r"(?<![\w.])\d+(?:\.\d+)?(?:e-?\d+)?(?![\w.]\d)"
+    section = (
+        (ROOT / "README.md").read_text(encoding="utf-8").split("## Measured against others")[1]
+    )
+    rows = [line.split("|") for line in section.partition("\n##")[0].splitlines() if "|" in line]
+    page = None
+    for _, _, ours, others, source, _ in rows[2:]:
+        page = next(iter(re.findall(r"\]\(([^)#]+)", source)), page)
+        on_page = [float(each) for each in re.findall(number, (ROOT / page).read_text())]
+        for given in re.findall(number, ours + others.replace("Mitsuba 3", "")):
+            digits = len(given.partition("e")[0].replace(".", "").lstrip("0"))
+            assert float(given) in [float(f"{each:.{digits}g}") for each in on_page], given
+
+
 WITH_PROGRAMS = [pytest.param(page, id=name(page)) for page in PAGES if fences(page, "python")]
 
 
