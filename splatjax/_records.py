@@ -120,6 +120,12 @@ def record(cls: Class) -> Class:
     return cls
 
 
+def check_class(name: str, value: Any, kind: type) -> None:
+    """Raise `ValueError` for a value that is no record of a class."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} must be {_call(kind)}; got {type(value).__name__}")
+
+
 def _call(cls: type) -> str:
     """Write out a call of a class with the names of its arguments; an abstract one has none."""
     parameters = ", ".join(inspect.signature(cls).parameters)

@@ -267,6 +267,22 @@ def test_nonsense_is_refused_by_name_and_value(make, message):
 EYE, TARGET = np.asarray([30.0, 20.0, 50.0]), np.asarray([1.0, -2.0, 3.0])
 
 
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: sj.render(splats(), camera()), "scene"),
+        (lambda: sj.make_plan(splats(), camera()), "scenes"),
+        (lambda: sj.make_plan(sj.Scene(splats(), light(), material()), splats()), "cameras"),
+        (lambda: sj.fit_gaussians(medium()), "profile"),
+        (lambda: sj.bust("large"), "count"),
+    ],
+)
+def test_an_object_of_another_kind_is_refused_by_name(make, name):
+    """By splatjax, or by the type checker of the tests."""
+    with pytest.raises((ValueError, TypeError), match=name):
+        make()
+
+
 def test_it_looks_at_the_target_upright():
     camera = sj.Camera.look_at(EYE, TARGET, fov=40.0, width=300, height=100)
     right, down, forward = np.asarray(camera.rotation)

@@ -232,9 +232,10 @@ class Fit:
             # A dipole depends only on the reduced coefficients.
             needs_g = self.g is not None or self.model not in ("dipole", "better-dipole")
             g = self._mean_cosine() if needs_g else 0.0
-            return coefficients, reference(
-                coefficients, self.model, self.photons, g, self.single_scattering
-            )
+            with sj.io.naming(self.medium):
+                return coefficients, reference(
+                    coefficients, self.model, self.photons, g, self.single_scattering
+                )
         if kind == _PROFILE:
             measured = sj.io.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
         elif self.mm_per_pixel is None:

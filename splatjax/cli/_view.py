@@ -140,6 +140,10 @@ class ViewOptions:
         name = self.environment_name
         if name in ENVIRONMENTS:
             return sj.EnvironmentLight(ENVIRONMENTS[name]())
+        if name and not Path(name).is_file():
+            raise ValueError(
+                f"{name}: there is no such file; built in are {', '.join(ENVIRONMENTS)}"
+            )
         return sj.io.load_environment(name) if name else None
 
     def load(self) -> tuple[sj.Splats, sj.Material]:

@@ -238,6 +238,10 @@ def make_problem(
     profile: AbstractProfile, weights: AbstractWeights, rule: AbstractRadialRule
 ) -> FitProblem:
     """Set up the fit of all channels of a profile."""
+    if not isinstance(profile, AbstractProfile):
+        raise ValueError(
+            f"profile must be a profile, such as Dipole(medium); got {type(profile).__name__}"
+        )
     r, dr = norm_radii(profile, rule)
     values = at_own_radii(profile, r)
     norm = jnp.sqrt(jnp.sum(dr * r * values * values, axis=0))

@@ -3,6 +3,7 @@ Voronoi cells in the tangent planes.
 """
 
 from concurrent.futures import ThreadPoolExecutor
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
@@ -151,8 +152,8 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
 
     **Raises:** `ValueError` when `count` is below 1 or the mesh has no area.
     """
-    if count < 1:
-        raise ValueError(f"count is {count}; at least one splat is needed")
+    if not isinstance(count, Real) or count < 1:
+        raise ValueError(f"count is {count!r}; at least one splat is needed")
     areas = mesh.face_areas() if len(mesh.faces) else np.zeros(0)
     if not areas.sum() > 0:
         raise ValueError(

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 
 from splatjax._memory import check_memory
+from splatjax._records import check_class
 from splatjax.scene import Camera, Scene, Splats, lights_by_kind
 
 # Lower bounds: a picture that needs more than the free memory by these does not fit.
@@ -37,9 +38,11 @@ def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
 
     - `is_lit`: false if the irradiance is given and the lights are not used.
 
-    **Raises:** `ValueError` when the channels disagree, or the memory of the device does not
-    suffice.
+    **Raises:** `ValueError` for other objects, when the channels disagree, or the memory of the
+    device does not suffice.
     """
+    check_class("scene", scene, Scene)
+    check_class("camera", camera, Camera)
     check_channels(scene)
     leaves = [leaf for leaf in jax.tree.leaves((scene, camera)) if isinstance(leaf, jax.Array)]
     if any(isinstance(leaf, Tracer) or not leaf.is_fully_addressable for leaf in leaves):

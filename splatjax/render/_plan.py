@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import Result, rounded_up
 from splatjax._combination import DeviceMesh
+from splatjax._records import check_class
 from splatjax.cache import kept, reuse_capacity
 from splatjax.gaussians import pad_gaussians
 from splatjax.scene import (
@@ -120,8 +121,8 @@ def make_plan(
     **Raises:** `ValueError` for incompatible cameras or scenes, or a rasterizer or diffuser that
     does not work over a mesh.
     """
-    cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
-    scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
+    cameras = list(cameras) if isinstance(cameras, Sequence) else [cameras]
+    scenes = list(scenes) if isinstance(scenes, Sequence) else [scenes]
     _check(scenes, cameras)
     (scene, *other_scenes), cameras = _on_one_device((scenes, cameras))
     scene, other_scenes, cameras = in_one_dtype(scene, other_scenes, cameras)
@@ -209,6 +210,9 @@ def plan_unless_traced(
 
 
 def _check(scenes: list[Scene], cameras: list[Camera]) -> None:
+    for name, records, kind in (("scenes", scenes, Scene), ("cameras", cameras, Camera)):
+        for each in records:
+            check_class(name, each, kind)
     if not cameras or not scenes:
         raise ValueError(
             f"a plan needs at least one scene and one camera; got {len(scenes)} scenes and "

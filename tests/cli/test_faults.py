@@ -33,6 +33,7 @@ specular = 0.07
 """
 MEDIA = {
     "negative.toml": MEDIUM.replace("0.0021", "-0.03"),
+    "thin.toml": MEDIUM.replace("eta = 1.5", "eta = 0.5"),
     "misspelt.toml": MEDIUM.replace("roughness", "roughnes"),
     "two.toml": """[fit]
 unit = "mm^2"
@@ -65,6 +66,7 @@ REFUSED = {
     "render scene.toml --azimuth 3": ["--azimuth is 3", "scene.toml"],
     "fit negative.toml": ["negative.toml", "sigma_a"],
     "render plate.ply --material negative.toml": ["negative.toml", "sigma_a"],
+    "fit thin.toml": ["thin.toml", "eta must be at least 1"],
     "fit misspelt.toml": ["'roughnes'", "'roughness'"],
     "render plate.ply --material two.toml": ["2 channels", "PNG", "1 or 3"],
     # Outputs.
@@ -84,6 +86,7 @@ REFUSED = {
     "render missing.ply --scale 0": ["--scale", "0"],
     "render missing.ply --environment-rotation nan": ["--environment-rotation", "nan"],
     "render plate.ply --environment missing.hdr": ["missing.hdr"],
+    "render plate.ply --environment overcst": ["overcst", "studio, overcast, sun"],
     "render plate.ply --background environment --fill 0": ["--background", "no --environment"],
     "render plate.ply --environment map.png": ["map.png", "encoded for a display"],
     "render missing.ply --environment studio --light-azimuth 30": ["--light-azimuth", "--env"],
