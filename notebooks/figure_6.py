@@ -18,7 +18,6 @@
 
 # %%
 # %matplotlib inline
-from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -46,7 +45,7 @@ materials = {name: sj.load_material(name) for name in ("marble", "ketchup", "who
 # its own exposure.
 
 # %%
-plain = replace(body, albedo=None)
+plain = body.without_maps()
 frames = [sj.render(sj.Scene(body, lights, sj.load_material("skin").white()), camera)]
 frames += [sj.render(sj.Scene(plain, lights, each), camera) for each in materials.values()]
 pictures = [frame.beauty / jnp.quantile(frame.beauty, 0.995) for frame in frames]

@@ -75,7 +75,7 @@ print("reflectance between nodes:", tabulated.round(4), "of the model:", exact.r
 # second table would interpolate as well; here each skin is one fit.
 
 # %%
-bust = replace(sj.bust(2500).scaled(1 / 8), albedo=None)
+bust = sj.bust(2500).scaled(1 / 8).without_maps()
 camera = sj.Camera.look_at((9.0, 1.0, 72.0), (0.0, -2.2, 0.0), fov=27.0, width=72, height=72)
 window = sj.DirectionalLight((-0.9, -0.6, -0.8), np.full(3, 2.4), cast_shadows=False)
 fill = sj.DirectionalLight((1.0, 0.1, -0.9), np.full(3, 0.5), cast_shadows=False)
@@ -103,7 +103,7 @@ plot_pictures(
 
 # %%
 SPLATS, SIZE, NOISE = 800, 36, 0.01
-figurine = replace(sj.bust(SPLATS).scaled(1 / 16), albedo=None)
+figurine = sj.bust(SPLATS).scaled(1 / 16).without_maps()
 view = sj.Camera.look_at((3.0, 0.0, 35.0), (0.0, -1.0, 0.0), fov=28.0, width=SIZE, height=SIZE)
 ways = (-1.0, -0.3, -0.7), (1.0, -0.3, -0.7), (0.1, -1.0, -0.7)
 lamps = [sj.DirectionalLight(way, np.full(3, np.pi), cast_shadows=False) for way in ways]

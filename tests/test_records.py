@@ -283,6 +283,11 @@ def test_an_object_of_another_kind_is_refused_by_name(make, name):
         make()
 
 
+def test_without_maps_the_material_alone_gives_the_surface():
+    plain = sj.bust(50).without_maps()
+    assert plain.albedo is plain.specular is plain.roughness is None
+
+
 def test_it_looks_at_the_target_upright():
     camera = sj.Camera.look_at(EYE, TARGET, fov=40.0, width=300, height=100)
     right, down, forward = np.asarray(camera.rotation)

@@ -44,6 +44,8 @@ class Studio(ViewOptions):
         self.check({"port": (1 <= self.port <= 65_535, "lie between 1 and 65535")})
         check_folder(self.output)
         check_viser()
+        if self.splats is not None and self.splats.suffix in (".toml", ".exr"):
+            raise ValueError(f"{self.splats} is a scene; the studio takes splats (PLY) and options")
         splats, material = self.load()
         middle = (splats.centers.min(axis=0) + splats.centers.max(axis=0)) / 2
         observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
@@ -79,7 +81,7 @@ class Studio(ViewOptions):
         path = self.splats and str(self.splats.absolute())
         splats = f"sj.read_splats({path!r}, up={self.up!r})" if path else f"sj.bust({self.count})"
         splats = splats if self.scale == 1 else f"{splats}.scaled({self.scale})"
-        splats = splats if self.albedo else f"dataclasses.replace({splats}, albedo=None)"
+        splats = splats if self.albedo else f"{splats}.without_maps()"
         if self.pictures is None:
             return {"splats": splats, "lights": f"[{', '.join(map(self._made, lights))}]"}
         pictures = str(self.pictures.absolute())

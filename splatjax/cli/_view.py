@@ -66,8 +66,8 @@ class ViewOptions:
     exposure: float = 0.0
     #: Let light spread below the surface. Without scattering it leaves where it enters.
     scattering: bool = True
-    #: Use the albedo of the splats (the built-in bust has one). Without it, the color is that of
-    #: the material.
+    #: Use the maps of the splats: albedo, specular and roughness (the built-in bust has those of
+    #: skin). Without them the material alone gives color and highlights.
     albedo: bool = True
     #: Number of splats of the built-in bust.
     count: int = 200_000
@@ -174,9 +174,9 @@ class ViewOptions:
         return material if self.scattering else material.opaque()
 
     def adjusted(self, splats: sj.Splats) -> sj.Splats:
-        """Return splats at the scale of the options, with or without their albedo."""
+        """Return splats at the scale of the options, with or without their maps."""
         splats = splats if self.scale == 1 else splats.scaled(self.scale)
-        return splats if self.albedo else replace(splats, albedo=None)
+        return splats if self.albedo else splats.without_maps()
 
     def lights(
         self, material: sj.Material, azimuth: float, light_azimuth: float

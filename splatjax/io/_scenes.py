@@ -3,7 +3,6 @@ picture is one, too.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -158,7 +157,7 @@ def _splats(table: Table) -> Splats:
         splats = sample_mesh(body, count, **unit) if is_mesh else read_splats(body, **unit)
     scale, albedo = table.number("scale", 1.0), table.one_of("albedo", (True, False), True)
     splats = splats if scale == 1 else splats.scaled(scale)
-    return splats if albedo else replace(splats, albedo=None)
+    return splats if albedo else splats.without_maps()
 
 
 def _camera(table: Table) -> Camera:

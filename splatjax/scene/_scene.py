@@ -1,5 +1,6 @@
 """Scenes (splats of a material under lights), cameras, and rendered frames."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
@@ -188,6 +189,10 @@ class Splats(eqx.Module):
         """
         scaled = self.centers * factor, self.radii * factor, self.areas * (factor * factor)
         return eqx.tree_at(lambda body: (body.centers, body.radii, body.areas), self, scaled)
+
+    def without_maps(self) -> "Splats":
+        """Remove albedo, specular and roughness: the material alone gives color and highlights."""
+        return dataclasses.replace(self, albedo=None, specular=None, roughness=None)
 
     def take(self, chosen: Int[Array, " chosen"]) -> "Splats":
         """Return the splats of these ascending indices. Indices beyond the number of splats give

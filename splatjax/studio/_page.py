@@ -81,6 +81,8 @@ class Page:
         check_viser()
         import viser
 
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"{folder} is a file; give a folder for what the page saves")
         folder.mkdir(exist_ok=True)
         self._session, self._where = session, (folder, recipe or {})
         self._saves = list[tuple[str, Controls]]()
@@ -124,6 +126,10 @@ class Page:
         start, curves = self._session.start, self._session.curves(self._session.start)
         gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         self._status = gui.add_markdown("starting ...")
+        gui.add_button("first view").on_click(lambda _: self._look_again())
+        kinds = tuple(kind for kind in SUFFIXES if kind != "Python" or self._where[1])
+        buttons = gui.add_button_group("save", kinds)
+        buttons.on_click(lambda event: self._change(event.target.value))
         self._handles = handles = {"layer": gui.add_dropdown("layer", LAYERS)}
         for name, (label, low, high) in _SLIDERS.items():
             value = getattr(start, name)
@@ -138,6 +144,9 @@ class Page:
         for handle in handles.values():
             handle.on_update(lambda _: self._change())
         self._numbers = gui.add_markdown("")
+        self._pixel = gui.add_markdown("click the picture for the parts of a pixel")
+        if self._observations:
+            self._add_search(gui)
         profiles, hidden = len(curves) - 1 - channels, {"points": {"show": False}}
         pens = ("60", 6), ("", 1.5)  # opacity and width
         series = [
@@ -159,12 +168,6 @@ class Page:
             legend={"show": False},
             aspect=1.8,
         )
-        kinds = tuple(kind for kind in SUFFIXES if kind != "Python" or self._where[1])
-        buttons = gui.add_button_group("save", kinds)
-        buttons.on_click(lambda event: self._change(event.target.value))
-        self._pixel = gui.add_markdown("")
-        if self._observations:
-            self._add_search(gui)
 
     def _add_search(self, gui: Any) -> None:
         self._search = Search(self._session, self._observations, self._follow)
@@ -200,7 +203,15 @@ class Page:
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.url}" style="width: 100%; height: 600px; border: 0"></iframe>'
 
+    def _look_again(self) -> None:
+        """Let all pages look from the first place."""
+        start = self._session.start
+        for client in self._joined:
+            client.camera.position, client.camera.look_at = start.eye, start.target
+
     def _change(self, *saves: str) -> None:
+        if saves:
+            self._status.content = "saving ..."
         self._saves += [(kind, self._controls()) for kind in saves]
         self._changed.set()
 
@@ -240,6 +251,7 @@ class Page:
         column, row = int(x * width - (width - camera.width) // 2), int(y * height)
         is_inside = 0 <= column < camera.width and row < camera.height
         self._picked = (column, row) if is_inside else None
+        self._pixel.content = f"pixel {column}, {row} ..." if is_inside else ""
         self._change()
 
     def _take_apart(self, controls: Controls) -> str:
@@ -247,6 +259,8 @@ class Page:
         if self._picked is None:
             return "click the picture for the parts of a pixel"
         parts = self._session.pixel(controls, *self._picked)
+        if not np.any(parts["radiance"]):
+            return "pixel {}, {} shows no surface".format(*self._picked)
         names = channel_names(len(parts["radiance"]))
         rows = [["pixel {}, {}".format(*self._picked), *names], ["---"] * (len(names) + 1)]
         for name, values in parts.items():
@@ -268,7 +282,7 @@ class Page:
 
     def _note_compiling(self, event: str, **_: Any) -> None:
         if event in COMPILING and threading.current_thread() is self._worker:
-            self._status.content = "compiling, which the next start has at once ..."
+            self._status.content = "compiling, once for this and later starts ..."
 
     def _work(self) -> None:
         while not self._closed.is_set():
@@ -276,6 +290,8 @@ class Page:
             self._changed.clear()
             try:
                 self._status.content = self._update(self._controls())
+            except (OSError, ValueError) as error:
+                self._status.content = str(error)
             except Exception as error:
                 self._status.content = f"{type(error).__name__}: {error}"
 
@@ -299,7 +315,9 @@ class Page:
         while self._saves:
             kind, saved = self._saves.pop(0)
             written += save(session, saved, *self._where, kind)
-        return f"saved {', '.join(path.name for path in written)}" if written else ""
+        if written:
+            return f"saved {', '.join(map(str, written))}"
+        return "" if picture.any() else "nothing is visible; the camera may be inside the body"
 
 
 def _canvas(width: int, height: int, client: Any) -> tuple[int, int]:

@@ -12,12 +12,12 @@ from ._session import Session
 SUFFIXES = {"TOML": [".toml"], "PNG": [".png"], "EXR": [".exr"], "Python": [".toml", ".py"]}
 _PROGRAM = '''"""Render {name}.png of the material in {name}.toml, beside this file."""
 
-import dataclasses
 from pathlib import Path
 
 import splatjax as sj
 from splatjax.studio import turned
 
+sj.cache.keep()
 here = Path(__file__).parent
 splats = {splats}
 lights = turned({lights}, {turn})
