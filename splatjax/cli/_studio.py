@@ -89,7 +89,9 @@ class Studio(ViewOptions):
 
     def _made(self, light: sj.scene.AbstractLight) -> str:
         if isinstance(light, sj.DirectionalLight):
-            arguments = f"{light.direction.tolist()}, {light.irradiance.tolist()}"
+            arguments = ", ".join(
+                str(sj.exports.plain_numbers(each)) for each in (light.direction, light.irradiance)
+            )
             return f"sj.DirectionalLight({arguments}, cast_shadows={light.cast_shadows})"
         assert isinstance(light, sj.EnvironmentLight)
         name = self.environment_name or ""
