@@ -179,6 +179,9 @@ class Fit:
         coefficients, target = self._target()
         fitted = self._fitted(target)
         print_fit(fitted, target)
+        if isinstance(coefficients, sj.Dipole):
+            paths = format_numbers(1 / coefficients.medium.sigma_t_prime, ".3g")
+            note(f"{self.medium}: mean free path {paths} mm")
         self._note_error(target, fitted)
         total = fitted.gaussians.total_reflectance()
         if float(total.max()) > 1 + 1e-3:
