@@ -307,7 +307,6 @@ class Page:
             return ""
         picture = session.picture(controls)
         self._show(picture)
-        self._pixel.content = self._take_apart(controls)
         if self._observations and np.allclose(
             self._place, [session.start.eye, session.start.target], rtol=_NEAR
         ):
@@ -315,6 +314,7 @@ class Page:
         while self._saves:
             kind, saved = self._saves.pop(0)
             written += save(session, saved, *self._where, kind)
+        self._pixel.content = self._take_apart(controls)
         if written:
             return f"saved {', '.join(map(str, written))}"
         return "" if picture.any() else "nothing is visible; the camera may be inside the body"
