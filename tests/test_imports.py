@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from importlib.metadata import distributions
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -43,6 +44,11 @@ assert before == jax.config.values
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout
     assert [name for name in LATER if name in json.loads(output)] == []
+
+
+def test_modules_are_short():
+    modules = Path(splatjax.__file__).parent.rglob("*.py")
+    assert [path.name for path in modules if path.read_text().count("\n") > 330] == []
 
 
 def test_public_names_are_few_and_submodules_documented():

@@ -66,8 +66,7 @@ class ViewOptions:
     exposure: float = 0.0
     #: Let light spread below the surface. Without scattering it leaves where it enters.
     scattering: bool = True
-    #: Use the maps of the splats: albedo, specular and roughness (the built-in bust has those of
-    #: skin). Without them the material alone gives color and highlights.
+    #: Use the maps of the splats (of the bust: skin). Without them the material alone is seen.
     albedo: bool = True
     #: Number of splats of the built-in bust.
     count: int = 200_000

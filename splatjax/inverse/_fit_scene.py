@@ -106,8 +106,7 @@ class FittedScene(eqx.Module):
     **Attributes:**
 
     - `splats`: the body.
-    - `cameras`, `lights`: the camera and the lights of each picture.
-    - `material`: the given material.
+    - `cameras`, `lights`: those of each picture; `material`: the given one.
     - `maps`: the values of each parameter of a `ParameterMap`, by name.
     - `losses`: at the start and after each step: the sum of the losses of all pixels and of the
       priors, divided by the number of values that count. About 1 if the residual is noise.
@@ -116,8 +115,7 @@ class FittedScene(eqx.Module):
     - `pictures`: rendered; NaN where a pixel does not count.
     - `residuals`: rendered minus observed pictures.
     - `result`: the outcome, as a message (`optimistix.RESULTS`).
-    - `coordinates`: coordinates of the parts; `state`: state of the fit, from which another fit
-      continues (`start`).
+    - `coordinates`: of the parts; `state`: of the fit, from which another continues (`start`).
     """
 
     splats: Splats

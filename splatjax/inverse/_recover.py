@@ -80,17 +80,12 @@ def recover(
     Give a start within a factor of three of both coefficients, or several starts. The error bars
     assume that shape, lights, camera and model are right; compare `recovery.chi_squared` with 1.
 
-    The search is weighted least squares on all pixels at once, and differentiates the whole graph:
-    coefficients, profile, Gaussians, layers, picture. The layers, which are expensive, depend only
-    on the variances of the Gaussians. They are rendered once for many steps of the
-    Levenberg-Marquardt method; nothing is compiled between steps or starts.
-
-    The first search uses fixed variances (`wide_variances`), which serve all coefficients within a
-    factor of three of the starts. Each further round fits `count` Gaussians to the coefficients
-    found so far, renders their layers and the derivatives of the layers with respect to the
-    variances, and searches again, until a round changes nothing. The angles of the light are
-    updated once a round. The final picture is the one that `render` makes of `Recovery.material`,
-    with the derivatives of `picture_jacobian`.
+    The search is weighted least squares on all pixels at once, through the whole graph. The layers,
+    which are expensive, depend only on the variances of the Gaussians, and are rendered once for
+    many Levenberg-Marquardt steps. First the variances are fixed (`wide_variances`). Each further
+    round fits `count` Gaussians to the coefficients found so far, renders their layers and the
+    derivatives of the layers with respect to the variances, and searches again, until a round
+    changes nothing.
 
     **Arguments:**
 
@@ -102,13 +97,11 @@ def recover(
     - `surface`: a material of known specular strength and roughness, and of the same index as the
       starts; its Gaussians are not used. By default there is no specular lobe.
     - `model`: `TransportModel()`, by default, or `DiffusionModel()`, the classical dipole.
-    - `count`: number of Gaussians.
-    - `weights`: the constraint of the weights; by default non-negative and with a fixed sum, as in
-      the materials of the library.
+    - `count`: number of Gaussians; `weights`: the constraint of their weights, by default
+      non-negative and with a fixed sum, as in the library.
     - `loss`: `SquaredLoss()`, or `HuberLoss()` where the model does not explain some pixels.
     - `settings`: settings of the renderer. By default the layers are eight times more accurate than
-      in `render`: for bright materials, an error of 0.1% of a picture is an error of 2% of the
-      absorption.
+      in `render`: 0.1% of a picture of a bright material is 2% of its absorption.
     - `progress`: called with a description of each stage, and the best medium so far.
 
     **Returns:** a `Recovery` in JAX's default precision: `jax.enable_x64` resolves small errors,
@@ -116,9 +109,8 @@ def recover(
     round with the least loss, with its error bars, and `result` and a `RuntimeWarning` report it.
     To continue, start from its `medium`.
 
-    **Raises:** `ValueError` for no observation or start, for channels that disagree, for starts
-    without absorption, for different indices of surface and starts, and for a picture without a
-    pixel that counts.
+    **Raises:** `ValueError` for no observation or start, channels that disagree, starts without
+    absorption, different indices of surface and starts, and a picture without pixels that count.
     """
     dtype, observations = jnp.result_type(float), list(observations)
     starts = [

@@ -108,9 +108,7 @@ def srgb_to_linear(encoded: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
 
 def write_png(
     path: StrPath,
-    picture: Frame
-    | Float[Array, "height width channels"]
-    | Float[np.ndarray, "height width channels"],
+    picture: Frame | Float[Array, "height width _"] | Float[np.ndarray, "height width _"],
     *,
     exposure: float = 0.0,
 ) -> None:
@@ -124,8 +122,8 @@ def write_png(
     - `exposure`: exposure in stops: the values are multiplied by `2^exposure` before they are
       encoded. Values above 1 are clipped.
 
-    **Raises:** `ValueError` for another suffix than `.png`, another number of channels, or an
-    exposure that is not finite, `FileNotFoundError` when the folder does not exist.
+    **Raises:** `ValueError` for another suffix, number of channels, or an exposure that is not
+    finite; `FileNotFoundError` when the folder does not exist.
     """
     check_suffix(path, ".png")
     values = picture.beauty if isinstance(picture, Frame) else picture
@@ -140,21 +138,17 @@ def write_animation(
 ) -> None:
     r"""Join pictures to one endlessly repeating animated WebP file, completely or not at all.
 
-    It is lossless, and plays in every browser.
-
-    **Arguments:**
+    **Arguments:** the file is lossless, and plays in every browser
 
     - `frames`: PNG files in order, at least one, all of one size.
     - `frames_per_second`: from 0.1 to 60; browsers slow down faster ones.
 
-    **Raises:** `ValueError` for no frames, frames of several sizes, and a speed out of range;
-    `OSError` when a frame cannot be read, or the folder does not exist.
+    **Raises:** `ValueError` for no frames, several sizes, and a speed out of range; `OSError` when
+    a frame cannot be read, or the folder does not exist.
     """
     if not frames or not 0.1 <= frames_per_second <= 60:
-        raise ValueError(
-            f"{path}: {len(frames)} frames at {frames_per_second:g} per second cannot be "
-            "written; give at least one frame, and 0.1 to 60 per second"
-        )
+        given = f"{path}: {len(frames)} frames at {frames_per_second:g} per second"
+        raise ValueError(f"{given}; give at least one frame, and 0.1 to 60 per second")
     # Whole milliseconds, but every frame begins when it should.
     begins = [round(1000 * i / frames_per_second) for i in range(len(frames) + 1)]
     options = {"save_all": True, "duration": np.diff(begins).tolist(), "loop": 0, "lossless": True}

@@ -58,6 +58,28 @@ def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
         _warn_once(message)
 
 
+def check_planned(scenes: list[Scene], cameras: list[Camera]) -> None:
+    """Raise `ValueError` for scenes and cameras that cannot share a plan."""
+    for name, records, kind in (("scenes", scenes, Scene), ("cameras", cameras, Camera)):
+        for each in records:
+            check_class(name, each, kind)
+    if not cameras or not scenes:
+        raise ValueError(
+            f"a plan needs at least one scene and one camera; got {len(scenes)} scenes and "
+            f"{len(cameras)} cameras"
+        )
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    if len(sizes) != 1:
+        raise ValueError(f"cameras of one plan must have pictures of one size; got {sizes}")
+    first = scenes[0]
+    for i, scene in enumerate(scenes[1:], 1):
+        if not eqx.tree_equal((first.splats, first.material), (scene.splats, scene.material)):
+            raise ValueError(
+                f"scenes of one plan may differ only in their lights, and scenes[{i}] has other "
+                "splats or another material"
+            )
+
+
 def check_displayable(channels: int) -> None:
     """Raise `ValueError` for a number of channels that a PNG file cannot show, before rendering."""
     if channels not in (1, 3):

@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import Result, rounded_up
 from splatjax._combination import DeviceMesh
-from splatjax._records import check_class
 from splatjax.cache import kept, reuse_capacity
 from splatjax.gaussians import pad_gaussians
 from splatjax.scene import (
@@ -28,7 +27,7 @@ from splatjax.scene import (
     lights_by_kind,
 )
 
-from ._checks import check_scene, in_one_dtype
+from ._checks import check_planned, check_scene, in_one_dtype
 from ._lighting import ShadowPlan, plan_views
 from ._settings import RenderSettings
 
@@ -123,7 +122,7 @@ def make_plan(
     """
     cameras = list(cameras) if isinstance(cameras, Sequence) else [cameras]
     scenes = list(scenes) if isinstance(scenes, Sequence) else [scenes]
-    _check(scenes, cameras)
+    check_planned(scenes, cameras)
     (scene, *other_scenes), cameras = _on_one_device((scenes, cameras))
     scene, other_scenes, cameras = in_one_dtype(scene, other_scenes, cameras)
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
@@ -207,27 +206,6 @@ def plan_unless_traced(
             "plan=splatjax.make_plan(scene, camera, settings)"
         )
     return make_plan(scene, camera, settings, mesh)
-
-
-def _check(scenes: list[Scene], cameras: list[Camera]) -> None:
-    for name, records, kind in (("scenes", scenes, Scene), ("cameras", cameras, Camera)):
-        for each in records:
-            check_class(name, each, kind)
-    if not cameras or not scenes:
-        raise ValueError(
-            f"a plan needs at least one scene and one camera; got {len(scenes)} scenes and "
-            f"{len(cameras)} cameras"
-        )
-    sizes = sorted({(camera.width, camera.height) for camera in cameras})
-    if len(sizes) != 1:
-        raise ValueError(f"cameras of one plan must have pictures of one size; got {sizes}")
-    first = scenes[0]
-    for i, scene in enumerate(scenes[1:], 1):
-        if not eqx.tree_equal((first.splats, first.material), (scene.splats, scene.material)):
-            raise ValueError(
-                f"scenes of one plan may differ only in their lights, and scenes[{i}] has other "
-                "splats or another material"
-            )
 
 
 def _on_one_device(tree: Result) -> Result:

@@ -37,7 +37,8 @@ from ._quadrature import (
     L2_QUADRATURE as L2_QUADRATURE,
     RadialRule as RadialRule,
 )
-from ._skin import Projected as Projected, Skin as Skin, SkinProfile as SkinProfile
+from ._projected import Projected as Projected
+from ._skin import Skin as Skin, SkinProfile as SkinProfile
 from ._slab import (
     AbstractSlabProfile as AbstractSlabProfile,
     LayeredMultipole as LayeredMultipole,

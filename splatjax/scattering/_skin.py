@@ -312,38 +312,3 @@ class SkinProfile(AbstractProfile):
 
     def length_scale(self) -> Float[Array, " channels"]:
         return PhotonBeam(self.dermis).length_scale()
-
-
-@record
-class Projected(AbstractProfile):
-    r"""A profile by wavelength, converted to red, green and blue by a matrix.
-
-    Converting the profile instead of the picture is exact only if light and albedo are the same at
-    all wavelengths, and the kernel of pass 4 has gain 1 (`diffusion.PlainMean`, or flat surfaces).
-    With `EscapeNormalization` the gain on a curved body differs by wavelength: render the
-    wavelengths, and convert the picture.
-
-    **Attributes:** (differentiable)
-
-    - `profile`: a profile of as many channels as the matrix has rows.
-    - `matrix`: as `io.spectrum_to_rgb` computes it.
-    """
-
-    profile: AbstractProfile
-    matrix: Float[Array, "wavelengths colors"] = eqx.field(converter=numbers)
-
-    singular: ClassVar[bool] = True
-
-    @property
-    def channels(self) -> int:
-        return self.matrix.shape[1]
-
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        return jnp.dot(self.profile(r), self.matrix)
-
-    def total_reflectance(self) -> Float[Array, " channels"]:
-        return self.profile.total_reflectance() @ self.matrix
-
-    def length_scale(self) -> Float[Array, " channels"]:
-        share = jnp.abs(self.matrix)
-        return self.profile.length_scale() @ (share / jnp.sum(share, axis=0, keepdims=True))

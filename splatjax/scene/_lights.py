@@ -95,12 +95,7 @@ class AbstractLight(eqx.Module):
 
 
 class AbstractLightSample(AbstractLight):
-    """A light from one point or direction.
-
-    **Attributes:** (static)
-
-    - `cast_shadows`: whether the light has a shadow map.
-    """
+    """A light from one point or direction. `cast_shadows`: whether it has a shadow map. Static."""
 
     if TYPE_CHECKING:  # to type checkers an abstract variable is the first argument of a class
 

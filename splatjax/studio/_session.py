@@ -4,11 +4,10 @@ import dataclasses
 from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from splatjax import fitting as _fitting
 from splatjax._display import to_display
@@ -24,13 +23,20 @@ from splatjax.render import (
     render,
     transfer,
 )
-from splatjax.scattering import AngularLaw, Medium
+from splatjax.scattering import Medium
 from splatjax.scene import Camera, EnvironmentLight, Frame, Scene, Splats
 
 from ._controls import SURFACE, Controls, rotation_about_y, turned
+from ._programs import (
+    blend,
+    changes_with_coefficients,
+    light_of_gaussians,
+    profile_curves,
+    variances_and_angles,
+    weights_of,
+)
 
 Kept = TypeVar("Kept")
-_WEIGHTS = _fitting.NonNegativeWeights(_fitting.FixedTotalReflectance())
 _MERGED = 4  # splats of the body, for which one stands while it moves
 _PLANNED = 1.2  # by which variances may differ from those of a plan
 _QUARTERS = (0.0, 90.0, 180.0, 270.0)  # degrees
@@ -148,14 +154,14 @@ class Session:
         """
         basis, gaussians = self._basis(self._full, controls), self._gaussians(controls)
         place, medium = (row, column), self._medium(controls)
-        light = _light_of_gaussians(basis, gaussians, place)
+        light = light_of_gaussians(basis, gaussians, place)
         highlight = controls.specular * basis.specular[place]
         parts = {"radiance": jnp.sum(light, axis=0) + highlight, "highlight": highlight}
         widths = np.sqrt(gaussians.variances).tolist()
         parts |= {f"{width:.2g} mm": of for width, of in zip(widths, light, strict=True)}
         if medium is not None:
             inputs = self.model, medium, self._variances, self._has_color
-            changes = _changes_with_coefficients(*inputs, basis, place)
+            changes = changes_with_coefficients(*inputs, basis, place)
             names = "per ln absorption", "per ln scattering"
             parts |= {name: controls.scale * of for name, of in zip(names, changes, strict=True)}
         return {name: np.asarray(values, np.float64) for name, values in parts.items()}
@@ -187,7 +193,7 @@ class Session:
         medium, gaussians = self._medium(controls), self._fitted(controls)
         widest = 3 * np.sqrt(np.max(self.own.material.gaussians.variances))
         radii = jnp.asarray(np.geomspace(0.01 * widest, widest, 120), self._variances.dtype)
-        rows = _curves(self.model, medium, gaussians, radii)
+        rows = profile_curves(self.model, medium, gaussians, radii)
         return [np.asarray(row, np.float64) for row in (radii, *rows)]
 
     def _medium(self, controls: Controls) -> Medium | None:
@@ -204,7 +210,7 @@ class Session:
             medium is material.medium and self._variances is material.gaussians.variances
         ):
             return material.gaussians
-        return _fit_weights(self.model, medium, self._variances)
+        return weights_of(self.model, medium, self._variances)
 
     def _gaussians(self, controls: Controls) -> SumOfGaussians:
         gaussians = self._fitted(controls)
@@ -223,7 +229,7 @@ class Session:
         held, self._angles = self._variances, material.angles
         self._variances = material.gaussians.variances
         if medium is not None and medium is not material.medium:
-            self._variances, angles = _fit(self.model, medium, held)
+            self._variances, angles = variances_and_angles(self.model, medium, held)
             self._angles = angles if self._has_color else None
         self._settled, self._fits = controls.coefficients, self._fits + 1
         if np.max(np.abs(np.log(self._variances / self._planned))) > np.log(_PLANNED):
@@ -276,7 +282,7 @@ class Session:
         if controls.layer in _SHARES:
             diffuse, specular = _SHARES[controls.layer]
             shares = jnp.asarray([diffuse, specular * controls.specular], basis.specular.dtype)
-            values = _blend(basis, self._gaussians(controls), shares)
+            values = blend(basis, self._gaussians(controls), shares)
         else:
             frame = body.keep("frame", keys, lambda: self.frame(controls, body))
             shadow = jnp.mean(frame.shadow, axis=0)[..., None]
@@ -287,80 +293,3 @@ class Session:
 
 def _plain(values: Numbers) -> tuple[float, ...]:
     return tuple(np.asarray(values, np.float64).tolist())
-
-
-@eqx.filter_jit
-def _blend(
-    basis: DiffusionBasis, gaussians: SumOfGaussians, shares: Float[Array, "2"]
-) -> Float[Array, "height width channels"]:
-    return shares[0] * (basis.beauty(gaussians) - basis.specular) + shares[1] * basis.specular
-
-
-@eqx.filter_jit
-def _light_of_gaussians(
-    basis: DiffusionBasis, gaussians: SumOfGaussians, place: tuple[int, int]
-) -> Float[Array, "gaussians channels"]:
-    """Compute what each Gaussian adds to the radiance of the pixel of a row and a column."""
-    layers, _ = basis.light.weigh(gaussians, jnp.zeros_like(gaussians.weights[0]))
-    radiance = gaussians.weights[:, :, None] * layers * basis.pixel_radiance_per_exitance[None]
-    row, column = place
-    at_pixel = basis.pixels == row * basis.specular.shape[1] + column
-    return jnp.sum(jnp.where(at_pixel, radiance, 0.0), axis=2)
-
-
-@eqx.filter_jit
-def _changes_with_coefficients(
-    model: _fitting.AbstractModel,
-    medium: Medium,
-    variances: Float[Array, " gaussians"],
-    has_color: bool,
-    basis: DiffusionBasis,
-    place: tuple[int, int],
-) -> list[Float[Array, " channels"]]:
-    """Differentiate the radiance of a pixel with respect to the logarithms of absorption and of
-    scattering. No channel depends on the coefficients of another.
-    """
-
-    def radiance(sigma_a, sigma_s_prime):
-        gaussians = _fit_weights(model, Medium(sigma_a, sigma_s_prime, medium.eta), variances)
-        gaussians = gaussians if has_color else gaussians.white()
-        return jnp.sum(_light_of_gaussians(basis, gaussians, place), axis=0)
-
-    coefficients = medium.sigma_a, medium.sigma_s_prime
-    none = jnp.zeros_like(medium.sigma_a)
-    directions = (medium.sigma_a, none), (none, medium.sigma_s_prime)
-    return [jax.jvp(radiance, coefficients, along)[1] for along in directions]
-
-
-@eqx.filter_jit
-def _fit_weights(
-    model: _fitting.AbstractModel, medium: Medium, variances: Float[Array, " gaussians"]
-) -> SumOfGaussians:
-    profile = model.profile(medium)
-    return _fitting.fit_weights(profile, variances, weights=_WEIGHTS, rule=model.rule)
-
-
-@eqx.filter_jit
-def _fit(
-    model: _fitting.AbstractModel, medium: Medium, variances: Float[Array, " gaussians"]
-) -> tuple[Float[Array, " gaussians"], AngularLaw | None]:
-    """Find variances near given ones, which stay where none better is found; and the angles."""
-    profile, start = model.profile(medium), _fitting.GivenVariances(variances)
-    fitted = _fitting.fit_gaussians(
-        profile, len(variances), weights=_WEIGHTS, start=start, rule=model.rule, throw=False
-    )
-    held = _fitting.fit_weights(profile, variances, weights=_WEIGHTS, rule=model.rule)
-    error = _fitting.relative_error(profile, held, model.rule)
-    is_better = jnp.max(fitted.error) < jnp.max(error)
-    return jnp.where(is_better, fitted.gaussians.variances, variances), model.angles(medium)
-
-
-@eqx.filter_jit
-def _curves(
-    model: _fitting.AbstractModel,
-    medium: Medium | None,
-    gaussians: SumOfGaussians,
-    radii: Float[Array, " radii"],
-) -> list[Float[Array, " radii"]]:
-    profiles = [gaussians] if medium is None else [model.profile(medium), gaussians]
-    return [radii * row for profile in profiles for row in profile(radii).T]

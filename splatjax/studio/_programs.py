@@ -1,0 +1,93 @@
+"""What a session computes while a slider moves: one compiled program each."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from splatjax import fitting as _fitting
+from splatjax.gaussians import SumOfGaussians
+from splatjax.render import DiffusionBasis
+from splatjax.scattering import AngularLaw, Medium
+
+_WEIGHTS = _fitting.NonNegativeWeights(_fitting.FixedTotalReflectance())
+
+
+@eqx.filter_jit
+def blend(
+    basis: DiffusionBasis, gaussians: SumOfGaussians, shares: Float[Array, "2"]
+) -> Float[Array, "height width channels"]:
+    """Compute a picture of these shares of diffuse and of specular light."""
+    return shares[0] * (basis.beauty(gaussians) - basis.specular) + shares[1] * basis.specular
+
+
+@eqx.filter_jit
+def light_of_gaussians(
+    basis: DiffusionBasis, gaussians: SumOfGaussians, place: tuple[int, int]
+) -> Float[Array, "gaussians channels"]:
+    """Compute what each Gaussian adds to the radiance of the pixel of a row and a column."""
+    layers, _ = basis.light.weigh(gaussians, jnp.zeros_like(gaussians.weights[0]))
+    radiance = gaussians.weights[:, :, None] * layers * basis.pixel_radiance_per_exitance[None]
+    row, column = place
+    at_pixel = basis.pixels == row * basis.specular.shape[1] + column
+    return jnp.sum(jnp.where(at_pixel, radiance, 0.0), axis=2)
+
+
+@eqx.filter_jit
+def changes_with_coefficients(
+    model: _fitting.AbstractModel,
+    medium: Medium,
+    variances: Float[Array, " gaussians"],
+    has_color: bool,
+    basis: DiffusionBasis,
+    place: tuple[int, int],
+) -> list[Float[Array, " channels"]]:
+    """Differentiate the radiance of a pixel with respect to the logarithms of absorption and of
+    scattering. No channel depends on the coefficients of another.
+    """
+
+    def radiance(sigma_a, sigma_s_prime):
+        gaussians = weights_of(model, Medium(sigma_a, sigma_s_prime, medium.eta), variances)
+        gaussians = gaussians if has_color else gaussians.white()
+        return jnp.sum(light_of_gaussians(basis, gaussians, place), axis=0)
+
+    coefficients = medium.sigma_a, medium.sigma_s_prime
+    none = jnp.zeros_like(medium.sigma_a)
+    directions = (medium.sigma_a, none), (none, medium.sigma_s_prime)
+    return [jax.jvp(radiance, coefficients, along)[1] for along in directions]
+
+
+@eqx.filter_jit
+def weights_of(
+    model: _fitting.AbstractModel, medium: Medium, variances: Float[Array, " gaussians"]
+) -> SumOfGaussians:
+    """Fit the weights to coefficients, for held variances."""
+    profile = model.profile(medium)
+    return _fitting.fit_weights(profile, variances, weights=_WEIGHTS, rule=model.rule)
+
+
+@eqx.filter_jit
+def variances_and_angles(
+    model: _fitting.AbstractModel, medium: Medium, variances: Float[Array, " gaussians"]
+) -> tuple[Float[Array, " gaussians"], AngularLaw | None]:
+    """Find variances near given ones, which stay where none better is found; and the angles."""
+    profile, start = model.profile(medium), _fitting.GivenVariances(variances)
+    fitted = _fitting.fit_gaussians(
+        profile, len(variances), weights=_WEIGHTS, start=start, rule=model.rule, throw=False
+    )
+    held = _fitting.fit_weights(profile, variances, weights=_WEIGHTS, rule=model.rule)
+    error = _fitting.relative_error(profile, held, model.rule)
+    is_better = jnp.max(fitted.error) < jnp.max(error)
+    return jnp.where(is_better, fitted.gaussians.variances, variances), model.angles(medium)
+
+
+@eqx.filter_jit
+def profile_curves(
+    model: _fitting.AbstractModel,
+    medium: Medium | None,
+    gaussians: SumOfGaussians,
+    radii: Float[Array, " radii"],
+) -> list[Float[Array, " radii"]]:
+    """Compute the profile, where there are coefficients, and the sum of Gaussians, times r."""
+    profiles = [gaussians] if medium is None else [model.profile(medium), gaussians]
+    return [radii * row for profile in profiles for row in profile(radii).T]
