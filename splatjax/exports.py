@@ -185,7 +185,6 @@ def plain_numbers(values: Any) -> Any:
     values = np.asarray(values)
     if values.dtype == np.float32:
         # Not `str`, which shows six digits once colour-science has been imported.
-        return np.vectorize(lambda x: float(np.format_float_scientific(x)), otypes=[object])(
-            values
-        ).tolist()
+        shortest = [float(np.format_float_scientific(x)) for x in values.ravel()]
+        return np.reshape(shortest, values.shape).tolist()
     return values.tolist()

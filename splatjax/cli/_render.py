@@ -4,7 +4,6 @@ animation, which resume after an interruption.
 
 import functools
 import math
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +16,7 @@ import tyro
 
 import splatjax as sj
 
-from ._scene import SCENE_FILES, camera_of, check_alone
+from ._scene import camera_of, check_alone, is_scene, scene_of_file
 from ._terminal import check_folder, check_options, check_output, complete, preview, stage
 from ._view import PictureOptions
 
@@ -88,8 +87,8 @@ class Render(PictureOptions):
         options = self
         if self._scene:
             check_alone(self)
-            diffusion = self._scene.entries["settings"].get("diffusion", "clusters")
-            options, rendered = replace(self, diffusion=diffusion), self._of_scene(self._scene.path)
+            rendered = self._of_scene(self._scene.path)
+            options = replace(self, **self._scene.entries["settings"])
         elif self.splats and self.stream:
             rendered = self._streamed(self.splats)
         else:
@@ -101,8 +100,7 @@ class Render(PictureOptions):
 
     @functools.cached_property
     def _scene(self) -> Any:
-        is_scene = self.splats and self.splats.suffix.lower() in SCENE_FILES
-        return sj.io.scene_table(self.splats) if is_scene else None
+        return sj.io.scene_table(self.splats) if self.splats and is_scene(self.splats) else None
 
     def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         if self.camera_file is None:
@@ -112,9 +110,8 @@ class Render(PictureOptions):
     def record(self, folder: Path, *scene: Any) -> dict[str, Any]:
         if not self._scene:
             return super().record(folder, *scene)
-        moved = os.path.relpath(self._scene.folder, folder)
         versions = {"splatjax": sj.__version__, "jax": jax.__version__}
-        return versions | {"folder": moved, "scene": self._scene.entries}
+        return versions | {"scene": scene_of_file(self._scene, self.settings, folder, *scene)}
 
     def _at_once(self) -> Rendered:
         splats, material = self.load()

@@ -1,4 +1,4 @@
-"""Scenes of the command line: a camera from a file, and a scene in the manifest of a picture."""
+"""Scenes of the command line: a camera from a file, and scenes as their files would be."""
 
 import os
 from dataclasses import MISSING, fields, replace
@@ -9,9 +9,7 @@ import splatjax as sj
 
 from ._terminal import option_name
 
-# Of scenes, and of pictures whose manifest is one.
-SCENE_FILES = (".toml", ".exr")
-_BESIDE = {"splats", "output", "background", "exposure", "half", "quiet"}
+_BESIDE = {"splats", "output", "background", "exposure", "half", "quiet", "host", "port"}
 
 
 def camera_of(source: str, mm_per_unit: float, up: str, height: int, scale: float) -> sj.Camera:
@@ -19,6 +17,11 @@ def camera_of(source: str, mm_per_unit: float, up: str, height: int, scale: floa
     path, _, name = ("", "", "0") if Path(source).exists() else source.rpartition(":")
     camera = sj.io.load_camera(path or source, name or "0", mm_per_unit=mm_per_unit, up=up)
     return replace(sj.io.resized(camera, height), position=camera.position * scale)
+
+
+def is_scene(path: Path) -> bool:
+    """Return whether a file describes a scene, or is a picture whose manifest is one."""
+    return path.suffix.lower() in (".toml", ".exr")
 
 
 def check_alone(options: Any) -> None:
@@ -32,25 +35,41 @@ def check_alone(options: Any) -> None:
             )
 
 
-def scene_record(
-    options: Any,
+def scene_of_options(options: Any, images: str | list[str], *record: Any) -> dict[str, Any]:
+    """Return a scene as its file would be, from options and the images of lights; `record` is as
+    for `scene_in_folder`.
+    """
+    body = {"file": str(options.splats)} if options.splats else {"bust": options.count}
+    body |= {"up": options.up, "scale": options.scale, "albedo": options.albedo}
+    return scene_in_folder(Path(), body, images, *record)
+
+
+def scene_of_file(table: Any, *record: Any) -> dict[str, Any]:
+    """Return a scene as its file would be, from that of another; `record` as above."""
+    images = [light.get("image", "") for light in table.entries["lights"]]
+    return scene_in_folder(table.folder, table.entries["splats"], images, *record)
+
+
+def scene_in_folder(
+    old: Path,
+    body: dict[str, Any],
+    images: str | list[str],
+    settings: sj.RenderSettings,
     folder: Path,
     material: sj.Material,
     lights: tuple[sj.scene.AbstractLight, ...],
     camera: sj.Camera,
 ) -> dict[str, Any]:
-    """Return a scene as its file in a folder would be."""
+    """Return a scene as its file in a folder would be, with files named from an old folder: of the
+    body, and an image of each light, or one for all.
+    """
 
-    def beside(path: Path | str) -> str:
-        return os.path.relpath(path, folder)
+    def moved(name: str) -> str:
+        return name if name in sj.io.ENVIRONMENTS else os.path.relpath(old / name, folder)
 
-    body = {"file": beside(options.splats)} if options.splats else {"bust": options.count}
-    image = options.environment_name or ""
-    image = image if image in sj.io.ENVIRONMENTS else beside(image or ".")
-    return sj.io.plain_scene(
-        body | {"up": options.up, "scale": options.scale, "albedo": options.albedo},
-        material,
-        camera,
-        [sj.io.plain_light(light, image) for light in lights],
-        options.settings,
-    )
+    body = body | {key: moved(body[key]) for key in ("file", "mesh") if key in body}
+    images = [images] * len(lights) if isinstance(images, str) else images
+    tables = [
+        sj.io.plain_light(light, moved(image)) for light, image in zip(lights, images, strict=True)
+    ]
+    return sj.io.plain_scene(body, material, camera, tables, settings)

@@ -1,30 +1,38 @@
 """`splatjax studio`: a scene in the browser, to turn and to change."""
 
 import threading
+import tomllib
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import equinox as eqx
+import numpy as np
 import tyro
 
 import splatjax as sj
-from splatjax.studio import Page, Session, check_viser
+from splatjax.studio import AsFile, Page, Session, check_viser
 
-from ._terminal import OptionalPath, check_folder
-from ._view import ENVIRONMENTS, ViewOptions
+from ._scene import check_alone, is_scene, scene_of_file, scene_of_options
+from ._terminal import OptionalPath, check_folder, note, stage
+from ._view import ViewOptions
 
 _DIRECTIONS = 64  # of the shadows of an environment
 
 
 @dataclass(frozen=True, kw_only=True)
 class Studio(ViewOptions):
-    """Open a page in the browser on which splats, or the built-in bust, can be turned and changed.
+    """Open a page in the browser on which splats, the built-in bust, or a scene can be turned and
+    changed.
 
     It needs viser, the extra `studio` of splatjax. The command prints the address of the page;
     Ctrl-C ends it. Sliders change the coefficients of a material that has a [medium]. The page
-    saves the material, pictures, and the program that renders a picture.
+    saves pictures, the material, and the scene, which `splatjax render` and the studio take. A
+    scene is a TOML file of body, material, lights and camera, or a picture of `splatjax render`.
 
-    Example: splatjax studio --material marble --no-albedo --scale 0.2
+    Examples: splatjax studio --material marble --no-albedo --scale 0.2
+              splatjax studio scene.toml
     """
 
     #: The folder for saved files. It is created if its parent exists.
@@ -43,60 +51,57 @@ class Studio(ViewOptions):
     def run(self) -> None:
         self.check({"port": (1 <= self.port <= 65_535, "lie between 1 and 65535")})
         check_folder(self.output)
-        check_viser()
-        if self.splats is not None and self.splats.suffix in (".toml", ".exr"):
-            raise ValueError(f"{self.splats} is a scene; the studio takes splats (PLY) and options")
-        splats, material = self.load()
-        middle = (splats.centers.min(axis=0) + splats.centers.max(axis=0)) / 2
-        observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
-        if observations:
-            camera, lights = observations[0].camera, observations[0].lights
-            along = (middle - camera.position) @ camera.rotation[2]
-            middle = camera.position + along * camera.rotation[2]
-        else:
-            camera, lights = self.camera(lambda: [splats], self.azimuth), self._lights(material)
-        scene = sj.Scene(splats, lights, material)
-        session = Session(scene, camera, middle, exposure=self.exposure)
-        recipe = self._recipe(session.own.lights)
-        place = {"host": self.host, "port": self.port}
-        page = Page(session, self.output, recipe, observations=observations, **place)
+        page = self.page()
         print(page.url, flush=True)
         try:
             threading.Event().wait()
         finally:
             page.close()
 
-    def _lights(self, material: sj.Material) -> list[sj.scene.AbstractLight]:
-        lights = self.lights(material, self.azimuth, self.single_light[0])
+    def page(self) -> Page:
+        """Return the page of the scene, which is open."""
+        check_viser()
+        observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
+        if self.splats is not None and is_scene(self.splats):
+            scene, camera, as_file = self._of_file(self.splats)
+        else:
+            scene, camera, as_file = self._of_options()
+        if observations:
+            scene, camera = replace(scene, lights=observations[0].lights), observations[0].camera
+        # Environments turn with shadows that are kept.
         directions = sj.scene.even_directions(_DIRECTIONS)
-        return [
+        lights = [
             replace(light, directions=directions)
-            if isinstance(light, sj.EnvironmentLight)
+            if isinstance(light, sj.EnvironmentLight) and light.directions is None
             else light
-            for light in lights
+            for light in scene.lights
         ]
+        centers, forward = np.asarray(scene.splats.centers), camera.rotation[2]
+        middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
+        target = camera.position + (middle - camera.position) @ forward * forward
+        scene = replace(scene, lights=tuple(lights))
+        session = Session(scene, camera, target, exposure=self.exposure)
+        place = {"host": self.host, "port": self.port}
+        return Page(session, self.output, as_file, observations=observations, **place)
 
-    def _recipe(self, lights: tuple[sj.scene.AbstractLight, ...]) -> dict[str, str]:
-        """Return expressions that make the splats and the lights."""
-        path = self.splats and str(self.splats.absolute())
-        splats = f"sj.read_splats({path!r}, up={self.up!r})" if path else f"sj.bust({self.count})"
-        splats = splats if self.scale == 1 else f"{splats}.scaled({self.scale})"
-        splats = splats if self.albedo else f"{splats}.without_maps()"
-        if self.pictures is None:
-            return {"splats": splats, "lights": f"[{', '.join(map(self._made, lights))}]"}
-        pictures = str(self.pictures.absolute())
-        return {"splats": splats, "lights": f"sj.io.read_observations({pictures!r})[0].lights"}
+    def _of_options(self) -> tuple[sj.Scene, sj.Camera, AsFile]:
+        splats, material = self.load()
+        lights = self.lights(material, self.azimuth, self.single_light[0])
+        camera, images = self.camera(lambda: [splats], self.azimuth), self.environment_name or ""
+        if self.pictures is not None:
+            first = tomllib.loads(self.pictures.read_text())["pictures"][0]
+            images = [light.get("image", "") for light in first["lights"]]
+            images = [
+                i if i in sj.io.ENVIRONMENTS else str(self.pictures.parent / i) for i in images
+            ]
+        as_file = partial(scene_of_options, self, images, sj.RenderSettings())
+        return sj.Scene(splats, lights, material), camera, as_file
 
-    def _made(self, light: sj.scene.AbstractLight) -> str:
-        if isinstance(light, sj.DirectionalLight):
-            arguments = ", ".join(
-                str(sj.exports.plain_numbers(each)) for each in (light.direction, light.irradiance)
-            )
-            return f"sj.DirectionalLight({arguments}, cast_shadows={light.cast_shadows})"
-        assert isinstance(light, sj.EnvironmentLight)
-        name = self.environment_name or ""
-        image = f"sj.io.load_environment({str(Path(name).absolute())!r}).image"
-        if name in ENVIRONMENTS:
-            image = f"sj.scene.{ENVIRONMENTS[name].__name__}()"
-        directions = f"sj.scene.even_directions({_DIRECTIONS})"
-        return f"sj.EnvironmentLight({image}, {float(light.rotation)}, directions={directions})"
+    def _of_file(self, path: Path) -> tuple[sj.Scene, sj.Camera, AsFile]:
+        check_alone(self)
+        with stage(f"loading {path}"):
+            table = sj.io.scene_table(path)
+            scene, camera, settings = sj.io.load_scene(path)
+        if not eqx.tree_equal(settings, sj.RenderSettings()):
+            note(f"{path}: the studio, and what it saves, are without [settings]")
+        return scene, camera, partial(scene_of_file, table, sj.RenderSettings())

@@ -15,7 +15,7 @@ import splatjax as sj
 from splatjax._memory import check_memory
 from splatjax.render import BYTES_PER_PIXEL, BYTES_PER_SPLAT, check_displayable
 
-from ._scene import scene_record
+from ._scene import scene_of_options
 from ._terminal import OptionalFloat, Rules, UpAxis, check_options, note, option_name, stage
 
 # Degrees: the fill is beside the camera, on the side away from the light.
@@ -271,10 +271,10 @@ class PictureOptions(ViewOptions):
     ) -> tuple[Path, Path]:
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
         picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
+        record = self.record(path.parent, material, lights, camera)
         summed = self.diffusion != "clusters"  # then the one layer is of no Gaussian
-        record: dict[str, Any] = {"manifest": self.record(path.parent, material, lights, camera)}
-        record["variances"] = None if summed else material.gaussians.variances.tolist()
-        sj.write_exr(path, frame, **record, camera=camera, half=self.half)
+        widths = None if summed else material.gaussians.variances.tolist()
+        sj.write_exr(path, frame, variances=widths, manifest=record, camera=camera, half=self.half)
         if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
             shown = np.asarray(lights[0].behind(frame, camera))
         elif self.background == "transparent":
@@ -285,17 +285,15 @@ class PictureOptions(ViewOptions):
 
     def record(self, folder: Path, *scene: Any) -> dict[str, Any]:
         """Return the manifest of a picture in a folder, for its material, lights and camera."""
-        return self.manifest() | {"scene": scene_record(self, folder, *scene)}
+        record = scene_of_options(self, self.environment_name or "", self.settings, folder, *scene)
+        return self.manifest() | {"scene": record}
 
     def manifest(self) -> dict[str, Any]:
         """Return everything on which the pictures depend: options by name, contents of their files,
         and versions.
         """
-        options = {
-            option_name(field): value
-            for field, value in asdict(self).items()
-            if field not in _NOT_IN_PICTURES
-        }
+        values = {name: v for name, v in asdict(self).items() if name not in _NOT_IN_PICTURES}
+        options = {option_name(name): value for name, value in values.items()}
         material = sj.io.material_path(self.material).read_text(encoding="utf-8")
         splats = f"{self.splats.name}, {sj.io.fingerprint(self.splats)}" if self.splats else None
         if self.environment and self.environment not in ENVIRONMENTS:

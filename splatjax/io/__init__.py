@@ -36,6 +36,7 @@ from ._tables import (
     read_profile as read_profile,
     spectrum_to_rgb as spectrum_to_rgb,
     write_columns as write_columns,
+    write_toml as write_toml,
 )
 from ._cameras import (
     load_camera as load_camera,

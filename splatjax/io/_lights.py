@@ -22,6 +22,7 @@ from splatjax.scene import (
     RectangleLight,
     SphereLight,
     SpotLight,
+    even_directions,
     overcast_sky,
     studio,
     sun_and_sky,
@@ -41,6 +42,13 @@ ENVIRONMENTS = {"studio": studio, "overcast": overcast_sky, "sun": sun_and_sky}
 _OF_MAPS = ("rotation", "strength", "up", "directions", "count", "cast_shadows")
 _ANGLES = ("inner_angle", "outer_angle")
 _OPTIONAL = _OF_MAPS + _ANGLES
+# Of lights that face a target: from where, and what that replaces.
+_AIMED = {
+    "spot": ("position", "direction"),
+    "beam": ("origin", "direction"),
+    "rectangle": ("center", "edges"),
+    "disk": ("center", "direction"),
+}
 _LIGHTS = {
     "directional": (DirectionalLight, ("direction", "irradiance", "cast_shadows")),
     "point": (PointLight, ("position", "intensity", "cast_shadows")),
@@ -51,7 +59,8 @@ _LIGHTS = {
     "sphere": (SphereLight, ("center", "radiance", "radius", "count", "cast_shadows")),
     "environment": (EnvironmentLight, ("image", *_OF_MAPS)),
 }
-LIGHT_ENTRIES = {"kind"}.union(*(names for _, names in _LIGHTS.values()))
+_FACING = {"target", "width", "height"}
+LIGHT_ENTRIES = _FACING.union({"kind"}, *(names for _, names in _LIGHTS.values()))
 
 
 def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
@@ -189,6 +198,9 @@ def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
     for kind, (record, names) in _LIGHTS.items():
         if type(light) is record:
             values = {name: getattr(light, name) for name in names if name != "image"}
+            if (given := values.get("directions")) is not None:
+                is_even = np.array_equal(given, even_directions(len(given)).astype(given.dtype))
+                values["directions"] = np.asarray(len(given)) if is_even else given
             plain = {n: plain_numbers(value) for n, value in values.items() if value is not None}
             return {"kind": kind} | ({"image": image} if "image" in names else {}) | plain
     raise ValueError(
@@ -212,14 +224,25 @@ def light_of(table: Table, channels: int) -> AbstractLight:
     """Make the light of a table, in the channels of a picture."""
     kind = table.one_of("kind", _LIGHTS)
     light, names = _LIGHTS[kind]
-    table = Table(table.path, table.name, table.entries, ("kind", *names), table.folder)
+    known, values = {"kind", *names}, dict[str, Any]()
+    if "target" in table.entries and kind in _AIMED:
+        place, aim = _AIMED[kind]
+        center, target = table.numbers(place), table.numbers("target")
+        values[aim] = target - center
+        if kind == "rectangle":
+            size = table.number("width"), table.number("height")
+            values[aim] = table.make(RectangleLight.facing, center, target, *size, 1.0).edges
+        known = known - {aim} | (_FACING if kind == "rectangle" else {"target"})
+    table = Table(table.path, table.name, table.entries, known)
     fields = [name for name in names if name in table.entries or name not in _OPTIONAL]
-    special = {"image", "count", "cast_shadows"}
-    values: dict[str, Any] = {name: table.numbers(name) for name in fields if name not in special}
+    special = {"image", "count", "cast_shadows", *values}
+    values |= {name: table.numbers(name) for name in fields if name not in special}
     if "count" in fields:
         values["count"] = int(table.number("count"))
     if kind == "environment":
         values["image"] = _environment_image(table)
+        if "directions" in values and values["directions"].ndim == 0:
+            values["directions"] = even_directions(int(values["directions"]))
     strength = values.get(light.strength_field, np.ones(1))
     table.make(check_values, light.strength_field, strength, "at least 0", lambda x: x >= 0)
     if strength.size not in (1, channels):

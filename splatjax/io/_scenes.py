@@ -87,8 +87,7 @@ def scene_table(path: StrPath) -> Table:
         record = read_manifest(path)
     else:
         record = {"scene": read_toml(path, "give the file of a scene, or a picture")}
-    folder = path.parent / str(record.get("folder", ""))
-    table = Table(path, "", record.get("scene"), _TABLES, folder)
+    table = Table(path, "", record.get("scene"), _TABLES)
     table.entries.setdefault("settings", {})
     return table
 

@@ -45,11 +45,9 @@ class Table:
     `names`.
     """
 
-    def __init__(
-        self, path: Path, name: str, entries: Any, names: Iterable[str], folder: Path | None = None
-    ):
+    def __init__(self, path: Path, name: str, entries: Any, names: Iterable[str]):
         self.path, self.name, self.entries = path, name, entries
-        self.folder = folder or path.parent  # of the files that it names
+        self.folder = path.parent  # of the files that it names
         self.where = f"{path}: [{name}]" if name else f"{path}:"
         if not isinstance(entries, dict):
             raise ValueError(f"{self.where} must be a table; it is {entries!r}")
@@ -61,7 +59,7 @@ class Table:
 
     def table(self, name: str, names: Iterable[str]) -> "Table":
         inner = f"{self.name} {name}".strip()
-        return Table(self.path, inner, self.entries.get(name), names, self.folder)
+        return Table(self.path, inner, self.entries.get(name), names)
 
     def tables(self, name: str, names: Iterable[str]) -> "list[Table]":
         """Return a list of tables within this one, from 1."""
@@ -69,7 +67,7 @@ class Table:
         if not isinstance(value, list) or not value:
             raise ValueError(f"{self.where} {name} must be one table or more; it is {value!r}")
         return [
-            Table(self.path, f"{self.name} {name} {number}".strip(), entries, names, self.folder)
+            Table(self.path, f"{self.name} {name} {number}".strip(), entries, names)
             for number, entries in enumerate(value, start=1)
         ]
 

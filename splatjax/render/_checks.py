@@ -11,7 +11,7 @@ from jax.core import Tracer
 
 from splatjax._memory import check_memory
 from splatjax._records import check_class
-from splatjax.scene import Camera, Scene, Splats, lights_by_kind
+from splatjax.scene import Camera, DiskLight, RectangleLight, Scene, Splats, lights_by_kind
 
 # Lower bounds: a picture that needs more than the free memory by these does not fit.
 BYTES_PER_SPLAT, BYTES_PER_PIXEL = 1000.0, 500.0
@@ -29,7 +29,7 @@ _RATIO = 1000.0
 def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
     r"""Raise for channels that disagree or too little memory, and warn of causes of black or
     meaningless pictures: no light, inverted normals, a camera inside the body, a body smaller than
-    the distance that light travels in it, or a thousand times larger.
+    the distance that light travels in it, or a thousand times larger, and a light that shines away.
 
     For traced scenes, and scenes distributed over several processes, only the channels are checked.
     Each warning is shown once.
@@ -114,6 +114,13 @@ def _warnings(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
         np.asarray(field)[::step].astype(np.float64)
         for field in (scene.splats.centers, scene.splats.normals, scene.splats.areas)
     )
+    for number, light in enumerate(scene.lights, 1):
+        is_flat = isinstance(light, RectangleLight | DiskLight)
+        if is_lit and is_flat and np.all((centers - np.asarray(light.center)) @ _normal(light) < 0):
+            yield (
+                f"light {number}, a {type(light).__name__}, shines away from the body; "
+                "turn it around"
+            )
     areas = areas * (scene.splats.count / len(areas))
     area = max(np.sum(areas), np.finfo(float).tiny)
     is_closed = np.linalg.norm(areas @ normals) < _CLOSED * area
@@ -139,6 +146,12 @@ def _warnings(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
                 f"the size of the body is {size:.3g} mm, and light travels {reach:.3g} mm "
                 "below its surface; check the units (mm), or scale the body by Splats.scaled"
             )
+
+
+def _normal(light: RectangleLight | DiskLight) -> np.ndarray:
+    if isinstance(light, DiskLight):
+        return np.asarray(light.direction)
+    return np.cross(*np.asarray(light.edges))
 
 
 def _winding_number(centers, normals, areas, camera: Camera) -> float:

@@ -4,6 +4,6 @@
 
 from ._controls import Controls as Controls, turned as turned
 from ._page import check_viser as check_viser, Page as Page
-from ._saving import save as save
+from ._saving import AsFile as AsFile, save as save
 from ._search import Search as Search
 from ._session import Session as Session

@@ -25,6 +25,7 @@ class Controls:
     - `eta`, `specular`, `roughness`: as those of a `Material`; `eta` is the medium's too.
     - `scale`: factor on the weights.
     - `turn`: of the lights about the vertical axis, degrees.
+    - `light_stops`: of each light, by which it is brighter; each doubles it.
     - `layer`: one of `LAYERS`.
     - `exposure`: stops.
     """
@@ -38,6 +39,7 @@ class Controls:
     roughness: float
     scale: float = 1.0
     turn: float = 0.0
+    light_stops: tuple[float, ...] = ()
     layer: str = "beauty"
     exposure: float = 0.0
 
@@ -72,3 +74,13 @@ def turned(lights: Iterable[AbstractLight], degrees: float) -> tuple[AbstractLig
         return dataclasses.replace(light, **vectors)
 
     return tuple(map(turn, lights)) if degrees else tuple(lights)
+
+
+def brightened(lights: Iterable[AbstractLight], stops: Iterable[float]) -> list[AbstractLight]:
+    """Double the power of each light by its number of stops."""
+    return [
+        dataclasses.replace(
+            light, **{light.strength_field: getattr(light, light.strength_field) * 2.0**stop}
+        )
+        for light, stop in zip(lights, stops, strict=True)
+    ]

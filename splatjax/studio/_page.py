@@ -7,7 +7,7 @@ import dataclasses
 import importlib.util
 import io
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,17 @@ from splatjax.inverse import Observation
 from splatjax.scattering import Medium
 
 from ._controls import LAYERS, Controls
-from ._saving import SUFFIXES, save
+from ._saving import SUFFIXES, AsFile, save
 from ._search import Search
 from ._session import Session
 
 _STILL = 0.15  # s without a change, after which the whole picture is computed
 _NEAR = 1e-5  # relative, of cameras that are the same
 _QUALITY = 92  # of JPEG
-_MOST = 4.0  # powers of 2
+_MOST, _STOPS = 4.0, 8.0  # powers of 2, of coefficients and of light
 _SLIDERS = {
     "turn": ("turn lights, °", -180.0, 180.0),
-    "exposure": ("exposure, stops", -8.0, 8.0),
+    "exposure": ("exposure, stops", -_STOPS, _STOPS),
     "scale": ("diffuse", 0.0, 1.0),
     "specular": ("specular", 0.0, 1.0),
     "roughness": ("roughness", 0.05, 1.0),
@@ -55,7 +55,7 @@ class Page:
     **Arguments:**
 
     - `folder`: the only one to which the page writes, under names of its own; made if missing.
-    - `recipe`: as for `save`. Without it the page does not offer the program of a picture.
+    - `as_file`: as for `save`.
     - `observations`: pictures of the body, the first of which has the session's camera and lights.
       The page then offers to recover the material, and shows how the search proceeds.
     - `host`: the address to listen at: by default no other computer reaches it.
@@ -72,7 +72,7 @@ class Page:
         self,
         session: Session,
         folder: Path = Path("studio"),
-        recipe: Mapping[str, str] | None = None,
+        as_file: AsFile | None = None,
         *,
         observations: Sequence[Observation] = (),
         host: str = "127.0.0.1",
@@ -84,7 +84,7 @@ class Page:
         if folder.exists() and not folder.is_dir():
             raise ValueError(f"{folder} is a file; give a folder for what the page saves")
         folder.mkdir(exist_ok=True)
-        self._session, self._where = session, (folder, recipe or {})
+        self._session, self._folder, self._as_file = session, folder, as_file
         self._saves = list[tuple[str, Controls]]()
         self._observations = observations
         self._place = np.asarray([session.start.eye, session.start.target])
@@ -127,14 +127,17 @@ class Page:
         gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         self._status = gui.add_markdown("starting ...")
         gui.add_button("first view").on_click(lambda _: self._look_again())
-        kinds = tuple(kind for kind in SUFFIXES if kind != "Python" or self._where[1])
-        buttons = gui.add_button_group("save", kinds)
+        buttons = gui.add_button_group("save", tuple(SUFFIXES))
         buttons.on_click(lambda event: self._change(event.target.value))
         self._handles = handles = {"layer": gui.add_dropdown("layer", LAYERS)}
         for name, (label, low, high) in _SLIDERS.items():
             value = getattr(start, name)
             low, high = min(low, value), max(high, value)
             handles[name] = gui.add_slider(label, low, high, 0.01, value)
+        lights = self._session.own.lights if len(start.light_stops) > 1 else ()
+        for number, light in enumerate(lights):
+            label = f"{type(light).__name__.removesuffix('Light').lower()} {number + 1}, stops"
+            handles[f"light {number}"] = gui.add_slider(label, -_STOPS, _STOPS, 0.01, 0.0)
         channels = self._session.own.material.channels
         names = ("all", *channel_names(channels)) if start.sigma_a else ()
         for field, label in _FACTORS.items() if names else ():
@@ -148,11 +151,10 @@ class Page:
         if self._observations:
             self._add_search(gui)
         profiles, hidden = len(curves) - 1 - channels, {"points": {"show": False}}
-        pens = ("60", 6), ("", 1.5)  # opacity and width
         series = [
             {"stroke": _COLORS[i % channels % 3] + opacity, "width": width, **hidden}
             for i in range(profiles + channels)
-            for opacity, width in [pens[i >= profiles]]
+            for opacity, width in [("60", 6) if i < profiles else ("", 1.5)]
         ]
         self._plot = gui.add_uplot(
             tuple(curves),
@@ -224,6 +226,8 @@ class Page:
                 number * 2 ** (values[f"{field} 0"] + values[f"{field} {channel}"])
                 for channel, number in enumerate(getattr(start, field), 1)
             )
+        stops = tuple(value for name, value in values.items() if name.startswith("light "))
+        changed["light_stops"] = stops or start.light_stops
         return dataclasses.replace(start, eye=tuple(eye), target=tuple(target), **changed)
 
     def _join(self, client: Any) -> None:
@@ -300,8 +304,8 @@ class Page:
         session, written = self._session, list[Path]()
         self._show(session.draft(controls))
         self._plot.data = tuple(session.curves(controls))
-        rows = {label: getattr(controls, field) for field, label in _FACTORS.items()}
-        shown = [f"{label}: {format_numbers(row, '.4g')} /mm" for label, row in rows.items() if row]
+        rows = [(label, getattr(controls, field)) for field, label in _FACTORS.items()]
+        shown = [f"{label}: {format_numbers(row, '.4g')} /mm" for label, row in rows if row]
         self._numbers.content = "  \n".join(shown)
         if not self._saves and self._changed.wait(_STILL):
             return ""
@@ -313,7 +317,7 @@ class Page:
             self._compare(picture)
         while self._saves:
             kind, saved = self._saves.pop(0)
-            written += save(session, saved, *self._where, kind)
+            written += save(session, saved, self._folder, kind, self._as_file)
         self._pixel.content = self._take_apart(controls)
         if written:
             return f"saved {', '.join(map(str, written))}"

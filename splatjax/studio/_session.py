@@ -26,7 +26,7 @@ from splatjax.render import (
 from splatjax.scattering import Medium
 from splatjax.scene import Camera, EnvironmentLight, Frame, Scene, Splats
 
-from ._controls import SURFACE, Controls, rotation_about_y, turned
+from ._controls import SURFACE, Controls, brightened, rotation_about_y, turned
 from ._programs import (
     blend,
     changes_with_coefficients,
@@ -105,7 +105,9 @@ class Session:
         eta, specular, roughness = (round(float(getattr(material, name)), 6) for name in SURFACE)
         places = _plain(camera.position), _plain(target)
         self.start = Controls(
-            *places, absorption, scattering, eta, specular, roughness, exposure=exposure
+            *(*places, absorption, scattering, eta, specular, roughness),
+            light_stops=(0.0,) * len(scene.lights),
+            exposure=exposure,
         )
         self.own, self.model = scene, model
         self.fov = float(np.degrees(2 * np.arctan(0.5 / camera.focal_length)))
@@ -176,7 +178,7 @@ class Session:
             medium=self._medium(controls),
             **surface,
         )
-        lights = turned(self.own.lights, controls.turn)
+        lights = brightened(turned(self.own.lights, controls.turn), controls.light_stops)
         return Scene((body or self._full).splats, lights, material)
 
     def camera(self, controls: Controls, body: _Body | None = None) -> Camera:
@@ -237,7 +239,8 @@ class Session:
 
     def _keys(self, controls: Controls) -> tuple[Hashable, Hashable]:
         """Return what the light on the splats depends on, and what the view does besides."""
-        light = controls.turn, controls.eta, controls.roughness, self._fits
+        turned = controls.turn, controls.light_stops
+        light = *turned, controls.eta, controls.roughness, self._fits
         return light, (controls.eye, controls.target)
 
     def _plan(self, body: _Body, controls: Controls) -> Plan:

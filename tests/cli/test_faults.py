@@ -63,7 +63,8 @@ REFUSED = {
     "render missing.toml": ["missing.toml", "scene"],
     # Contents.
     "render scene.toml": ["scene.toml", "[splats] must be a table"],
-    "studio scene.toml": ["scene.toml is a scene", "takes splats"],
+    "studio scene.toml": ["scene.toml", "[splats] must be a table"],
+    "studio scene.toml --azimuth 3": ["--azimuth is 3", "scene.toml"],
     "render scene.toml --azimuth 3": ["--azimuth is 3", "scene.toml"],
     "fit negative.toml": ["negative.toml", "sigma_a"],
     "render plate.ply --material negative.toml": ["negative.toml", "sigma_a"],

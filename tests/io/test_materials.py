@@ -153,6 +153,7 @@ def test_a_saved_material_comes_back_bit_for_bit(tmp_path, model):
     assert eqx.tree_equal((load_material(path), load_profile(path)), (material, profile))
     assert load_mean_cosine(path) == (0.0 if medium is None else 0.75)
     assert f'profile = "{model}, exact Fresnel moments"' in path.read_text()
+    assert "\neta = 1.37\n" in path.read_text()  # the shortest number that is read back exactly
 
 
 @pytest.mark.parametrize(

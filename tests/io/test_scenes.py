@@ -58,10 +58,9 @@ def test_a_scene_comes_back_from_its_file_and_from_a_manifest(tmp_path):
     camera = replace(CAMERA, principal_point=[0.4, 0.6], near=0.5)
     save_scene(tmp_path / "a.toml", scene, camera, SHAPE)
     close(load_scene(tmp_path / "a.toml"), (scene, camera, SHAPE))
-    manifest = {"folder": "..", "scene": tomllib.loads((tmp_path / "a.toml").read_text())}
-    (tmp_path / "pictures").mkdir()
-    sj.write_exr(tmp_path / "pictures" / "a.exr", some_frame(), manifest=manifest)
-    close(load_scene(tmp_path / "pictures" / "a.exr"), (scene, camera, SHAPE))
+    manifest = {"scene": tomllib.loads((tmp_path / "a.toml").read_text())}
+    sj.write_exr(tmp_path / "a.exr", some_frame(), manifest=manifest)
+    close(load_scene(tmp_path / "a.exr"), (scene, camera, SHAPE))
     for diffuser in (sj.diffusion.ExitanceDiffuser(), sj.diffusion.ClusterDiffuser()):
         save_scene(tmp_path / "b.toml", scene, camera, sj.RenderSettings(diffuser=diffuser))
         assert load_scene(tmp_path / "b.toml")[2].diffuser == diffuser
@@ -92,6 +91,56 @@ def test_a_scene_by_hand_names_files_beside_it(by_hand):
     assert eqx.tree_equal(settings, sj.RenderSettings())
     expected = load_cameras(by_hand.with_name("cameras") / "colmap", mm_per_unit=2.0)["left 1.png"]
     close(camera, replace(expected, width=320, height=240))
+
+
+AIMED = """[[lights]]
+kind = "rectangle"
+center = [-60, 50, 60]
+target = [0, 5, 0]
+width = 30
+height = 40
+radiance = 2
+[[lights]]
+kind = "disk"
+center = [1, 2, 3]
+target = [0, 5, 0]
+radius = 4
+radiance = 3
+[[lights]]
+kind = "spot"
+position = [1, 2, 3]
+target = [0, 5, 0]
+intensity = 3
+[[lights]]
+kind = "environment"
+image = "overcast"
+directions = 9
+"""
+
+
+def test_lights_may_face_a_target(by_hand, tmp_path):
+    path = write_any(by_hand, BY_HAND.split("[[lights]]")[0] + AIMED)
+    scene, *others = load_scene(path)
+    facing = sj.scene.RectangleLight.facing
+    assert eqx.tree_equal(
+        scene.lights,
+        (
+            facing([-60, 50, 60], [0, 5, 0], 30, 40, [2, 2, 2]),
+            sj.scene.DiskLight([1, 2, 3], [3, 3, 3], [-1, 3, -3], 4),
+            sj.scene.SpotLight([1, 2, 3], [-1, 3, -3], [3, 3, 3]),
+            sj.EnvironmentLight(
+                sj.scene.overcast_sky(),
+                0,
+                [1, 1, 1],
+                directions=sj.scene.even_directions(9),
+            ),
+        ),
+    )
+    save_scene(tmp_path / "saved.toml", scene, *others)
+    assert "directions = 9\n" in (tmp_path / "saved.toml").read_text()
+    both = AIMED.replace("radius", "direction = [0, 0, 1]\nradius")
+    path = write_any(by_hand, BY_HAND.split("[[lights]]")[0] + both)
+    refused(path, "unknown entry 'direction'", load_scene, ValueError)
 
 
 @pytest.mark.parametrize(

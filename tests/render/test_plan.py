@@ -186,6 +186,7 @@ def camera(distance: float = 50.0) -> sj.Camera:
     return sj.Camera.look_at([0, 0, distance], [0, 0, distance - 1], width=8, height=8)
 
 
+DISK = sj.scene.DiskLight([0, 0, 60], 3.0, [0, 0.1, 1], 5.0)
 FLIPPED = eqx.tree_at(lambda splats: splats.normals, sphere(2000), replace_fn=lambda n: -n)
 
 
@@ -196,6 +197,7 @@ FLIPPED = eqx.tree_at(lambda splats: splats.normals, sphere(2000), replace_fn=la
         (scene(lights=[sj.PointLight([0, 0, 50], 0)]), 50, "no light"),
         (scene(FLIPPED), 50, "normals of the splats point into the body"),
         (scene(), 3, "camera is inside the body"),
+        (scene(lights=[DISK]), 50, "light 1, a DiskLight, shines away"),
         (scene(sphere(2000, 0.2)), 50, "check the units"),
         (scene(sphere(2000, 20_000.0)), 50_000, "check the units"),
     ],
@@ -214,6 +216,7 @@ def test_a_scene_that_nobody_means_is_warned_of_once(wrong, distance, message):
     [
         scene(),
         scene(sheet(10.0, 0.5)),
+        scene(lights=[sj.scene.RectangleLight.facing([0, 0, 60], [0, 9, 0], 5, 5, 3.0)]),
         scene(sj.Splats(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))),
         eqx.tree_at(lambda s: s.material, scene(sphere(2000, 2000.0)), scene().material.opaque()),
     ],

@@ -11,12 +11,15 @@ import runpy
 import shutil
 import time
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from pictures import write_picture
 from PIL import Image
 
 import splatjax as sj
+from splatjax.cli._studio import Studio
 from splatjax.studio import Page, Search, Session, save, turned
 
 pytestmark = pytest.mark.once
@@ -26,16 +29,12 @@ SIDE = 48
 SAME = 1
 # The mean of a picture of 375 splats and 16 x 16 pixels.
 COARSE = 0.25
-RECIPE = {
-    "splats": "sj.bust(1500).scaled(0.1).without_maps()",
-    "lights": "[sj.DirectionalLight([1, -0.3, -1], 3.0)]",
-}
 
 
 @pytest.fixture(scope="module")
 def studio():
-    names = {"sj": sj, "dataclasses": dataclasses}
-    splats, lights = (eval(RECIPE[name], names) for name in ("splats", "lights"))
+    splats = sj.bust(1500).scaled(0.1).without_maps()
+    lights = [sj.DirectionalLight([1, -0.3, -1], 3.0), sj.PointLight([-30, 0, 60], 1e3)]
     camera = sj.Camera.look_at([20, 0, 70], [0, 0, 0], width=SIDE, height=SIDE)
     session = Session(sj.Scene(splats, lights, sj.load_material("marble")), camera, [0, 0, 0])
     session.picture(session.start)  # whose plan serves all changes
@@ -52,7 +51,7 @@ def states(studio):
     double = tuple(2 * number for number in studio.start.sigma_a)
     absorption = with_(studio.start, sigma_a=double, exposure=0.5)
     surface = with_(absorption, eta=1.3, specular=0.5, roughness=0.5, scale=0.7)
-    moved = with_(surface, eye=(-40.0, 20.0, 30.0), turn=70.0)
+    moved = with_(surface, eye=(-40.0, 20.0, 30.0), turn=70.0, light_stops=(-0.5, 1.0))
     return {"absorption": absorption, "surface": surface, "camera and light": moved}
 
 
@@ -147,15 +146,15 @@ def test_layers_are_those_of_the_frame(studio, layer):
 
 def test_what_is_saved_makes_the_picture_again(studio, states, tmp_path, monkeypatch):
     monkeypatch.setattr(sj.cache, "keep", lambda: None)
-    controls = with_(states["absorption"], turn=30.0)
+    controls = with_(states["camera and light"], turn=30.0)
     paths = [
         path
-        for kind in ("PNG", "EXR", "Python")
-        for path in save(studio, controls, tmp_path, RECIPE, kind)
+        for kind in ("PNG", "EXR", "material", "scene")
+        for path in save(studio, controls, tmp_path, kind)
     ]
-    names = ["studio_000.png", "studio_001.exr", "studio_002.toml", "studio_002.py"]
-    assert [path.name for path in paths] == names
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
+    names = ["studio_000.png", "studio_001.exr", "studio_002.toml", "studio_003.toml"]
+    assert [path.name for path in paths] == [*names, "studio_003.py"]
+    assert {path.name for path in tmp_path.iterdir()} == {*names, "studio_003.py", "studio_003.ply"}
     runpy.run_path(str(paths[-1]))
     first, again = (
         np.asarray(Image.open(path), int) for path in (paths[0], paths[-1].with_suffix(".png"))
@@ -163,7 +162,63 @@ def test_what_is_saved_makes_the_picture_again(studio, states, tmp_path, monkeyp
     assert np.abs(first - again).max() <= SAME
     frame = sj.read_exr(paths[1])
     assert np.abs(shown(frame, controls) - first).max() <= SAME
-    assert "studio_001.png" in sj.io.read_manifest(paths[1])["program"]
+    material = sj.load_material(paths[2])
+    assert eqx.tree_equal(material, sj.io.load_scene(paths[3])[0].material)
+
+
+SCENE = """
+material = "marble"
+[splats]
+bust = 1500
+scale = 0.1
+albedo = false
+[camera]
+position = [20, 0, 70]
+target = [0, -3, 0]
+width = 48
+height = 48
+[[lights]]
+kind = "environment"
+image = "maps/sky.exr"
+[[lights]]
+kind = "point"
+position = [-30, 0, 60]
+intensity = 1000
+[settings]
+bounces = 1
+"""
+
+
+@pytest.mark.filterwarnings("default")  # of viser and of the libraries that it stands on
+def test_a_scene_file_opens_and_what_is_saved_is_one(tmp_path, capsys):
+    pytest.importorskip("viser")
+    scene, looks = tmp_path / "scene.toml", tmp_path / "looks"
+    scene.write_text(SCENE)
+    (tmp_path / "maps").mkdir()
+    write_picture(tmp_path / "maps" / "sky.exr", np.asarray(sj.scene.overcast_sky()))
+    page = Studio(splats=scene, output=looks, port=18_070).page()
+    page._handles["light 1"].value = -2.0
+    page._handles["turn"].value = 30.0
+    page._change("scene", "EXR")
+    wait_until(lambda: "studio_001.exr" in page._status.content)
+    page.close()
+    assert "without [settings]" in capsys.readouterr().err
+    assert {path.name for path in looks.iterdir()} == {
+        "studio_000.toml",
+        "studio_000.py",
+        "studio_001.exr",
+    }
+    saved, *_ = sj.io.load_scene(looks / "studio_000.toml")
+    of_exr, camera, settings = sj.io.load_scene(looks / "studio_001.exr")
+    assert eqx.tree_equal(saved, of_exr)
+    lamp, sky = saved.lights[1], saved.lights[0]
+    np.testing.assert_allclose(lamp.intensity, 250)
+    assert float(sky.rotation) == 30.0
+    picture = sj.render(of_exr, camera, settings)
+    assert picture.beauty.max() > 0.1
+    np.testing.assert_allclose(
+        picture.beauty, sj.read_exr(looks / "studio_001.exr").beauty, atol=0.004
+    )
 
 
 def test_lights_turn_about_the_vertical_axis():
@@ -208,7 +263,7 @@ def page(studio, tmp_path):
     pytest.importorskip("viser")
     session = Session(studio.own, studio.camera(studio.start), [0, 0, 0])
     (tmp_path / "saved").mkdir()
-    page = Page(session, tmp_path / "saved", RECIPE, port=18_080)
+    page = Page(session, tmp_path / "saved", port=18_080)
     yield page
     page.close()
 
@@ -227,8 +282,8 @@ def test_only_this_computer_reaches_the_page_and_it_writes_to_one_folder(page, t
     assert page._server.get_host() == "127.0.0.1"
     assert page._server.request_share_url() is None
     page._handles["sigma_a 0"].value = 1.0
-    page._change("PNG", "Python")
-    names = ["studio_000.png", "studio_001.py", "studio_001.toml"]
+    page._change("PNG", "material")
+    names = ["studio_000.png", "studio_001.toml"]
     wait_until(lambda: len([*tmp_path.rglob("studio_*.*")]) == len(names))
     assert sorted(path.name for path in (tmp_path / "saved").iterdir()) == names
     saved = sj.load_medium(tmp_path / "saved" / "studio_001.toml").sigma_a
