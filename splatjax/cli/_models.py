@@ -79,7 +79,10 @@ def reference(
                 "a [skin] is fitted by light transport in its layers, with the g of its table; "
                 "leave --model, --g and --single-scattering out"
             )
-        return _skin(coefficients)
+        # In linear sRGB, under daylight.
+        skin = sj.fitting.SkinModel(sj.io.spectrum_to_rgb(coefficients.wavelengths))
+        angles, profile = skin.angles(coefficients), skin.profile(coefficients)
+        return Reference(profile, skin.rule, None, skin.description, angles)
     is_layered = isinstance(coefficients, sj.LayeredMultipole)
     model = model or ("dipole" if is_layered else "photon-beam")
     option = f"--model {model}{' with --single-scattering' if single_scattering else ''}"
@@ -103,15 +106,6 @@ def reference(
     single, angles = _parted(sj.scattering.HalfSpace(medium, g))
     description = f"{description}, without single scattering"
     return Reference(profile.multiply_scattered(), _BEYOND, single, description, angles)
-
-
-def _skin(skin: sj.scattering.Skin) -> Reference:
-    """Return the profile of skin in linear sRGB, under daylight."""
-    matrix = jnp.asarray(sj.io.spectrum_to_rgb(skin.wavelengths))
-    profile, half_space = skin.profile(), skin.half_space()
-    angles = half_space.angular_law().projected(profile.total_reflectance(), matrix)
-    description = "photon beams of dermis and epidermis with the total of light transport, as sRGB"
-    return Reference(sj.scattering.Projected(profile, matrix), _BEYOND, None, description, angles)
 
 
 def _parted(

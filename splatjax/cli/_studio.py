@@ -64,8 +64,10 @@ class Studio(ViewOptions):
         observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
         if self.splats is not None and is_scene(self.splats):
             scene, camera, as_file = self._of_file(self.splats)
+            skin = sj.io.load_skin(sj.io.material_of_scene(sj.io.scene_table(self.splats)))
         else:
             scene, camera, as_file = self._of_options()
+            skin = sj.io.load_skin(self.material)
         if observations:
             scene, camera = replace(scene, lights=observations[0].lights), observations[0].camera
         # Environments turn with shadows that are kept.
@@ -80,7 +82,7 @@ class Studio(ViewOptions):
         middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
         target = camera.position + (middle - camera.position) @ forward * forward
         scene = replace(scene, lights=tuple(lights))
-        session = Session(scene, camera, target, exposure=self.exposure)
+        session = Session(scene, camera, target, exposure=self.exposure, skin=skin)
         place = {"host": self.host, "port": self.port}
         return Page(session, self.output, as_file, observations=observations, **place)
 

@@ -13,6 +13,7 @@ from ._models import (
     DiffusionModel as DiffusionModel,
     fit_medium as fit_medium,
     MediumFit as MediumFit,
+    SkinModel as SkinModel,
     TransportModel as TransportModel,
     weight_factors as weight_factors,
 )

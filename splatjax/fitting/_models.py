@@ -4,7 +4,7 @@ light; and fits of optical coefficients to a measured profile.
 
 import abc
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from splatjax._records import as_floats, check_values
+from splatjax._records import as_floats, check_values, numbers
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
     L2_QUADRATURE,
@@ -23,6 +23,8 @@ from splatjax.scattering import (
     HalfSpace,
     Medium,
     PhotonBeam,
+    Projected,
+    Skin,
     Tabulated,
 )
 
@@ -48,10 +50,10 @@ class AbstractModel(eqx.Module):
     description: ClassVar[str | None] = None
 
     @abc.abstractmethod
-    def profile(self, medium: Medium) -> AbstractProfile:
-        """Compute the profile of a medium. Differentiable."""
+    def profile(self, medium: Any) -> AbstractProfile:
+        """Compute the profile of a medium; `SkinModel` takes a `Skin`. Differentiable."""
 
-    def angles(self, medium: Medium) -> AngularLaw | None:
+    def angles(self, medium: Any) -> AngularLaw | None:
         """Compute the dependence of the light on the angles of entry and exit; `None` for none."""
         return None
 
@@ -101,6 +103,33 @@ class TransportModel(AbstractModel):
 
     def angles(self, medium: Medium) -> AngularLaw:
         return self.half_space(medium).angular_law()
+
+
+class SkinModel(AbstractModel):
+    r"""Skin from its pigments: its profile and angles by light transport, as colors.
+
+        skin = Skin(melanin=0.03)
+        model = SkinModel(io.spectrum_to_rgb(skin.wavelengths))
+        fitted = fit_gaussians(model.profile(skin), weights=weights, rule=model.rule)
+
+    **Attributes:**
+
+    - `matrix`: from the wavelengths of the skin to red, green and blue. Differentiable.
+    """
+
+    matrix: Float[Array, "wavelengths colors"] = eqx.field(converter=numbers)
+
+    rule: ClassVar[AbstractRadialRule] = TransportModel.rule
+    description: ClassVar[str | None] = (
+        "photon beams of dermis and epidermis with the total of light transport, as sRGB"
+    )
+
+    def profile(self, medium: Skin) -> Projected:
+        return Projected(medium.profile(), self.matrix)
+
+    def angles(self, medium: Skin) -> AngularLaw:
+        total = medium.profile().total_reflectance()
+        return medium.half_space().angular_law().projected(total, self.matrix)
 
 
 def weight_factors(

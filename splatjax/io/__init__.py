@@ -25,7 +25,9 @@ from ._materials import (
     load_mean_cosine as load_mean_cosine,
     load_medium as load_medium,
     load_profile as load_profile,
+    load_skin as load_skin,
     material_path as material_path,
+    plain_material as plain_material,
     profiles_folder as profiles_folder,
     save_material as save_material,
     surface_and_source as surface_and_source,
@@ -56,6 +58,7 @@ from ._lights import (
 from ._scenes import (
     DIFFUSERS as DIFFUSERS,
     load_scene as load_scene,
+    material_of_scene as material_of_scene,
     plain_scene as plain_scene,
     scene_table as scene_table,
     save_scene as save_scene,

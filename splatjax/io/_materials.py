@@ -179,6 +179,15 @@ def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin:
     return _profile(_tables(name_or_path)) or Dipole(load_medium(name_or_path))
 
 
+def load_skin(material: StrPath | Table) -> Skin | None:
+    """Load the pigments of a material, or of the tables of one; `None` if it has no [skin].
+
+    **Raises:** `ValueError` as `load_medium` does.
+    """
+    profile = _profile(material if isinstance(material, Table) else _tables(material))
+    return profile if isinstance(profile, Skin) else None
+
+
 def save_material(
     material: Material,
     path: StrPath,

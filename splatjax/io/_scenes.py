@@ -66,11 +66,12 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
     """
     file = scene_table(path)
     splats = _splats(file.table("splats", _BODY))
-    if isinstance(name := file.entries.get("material"), str):
-        material = file.make(load_material, file.folder / name if Path(name).suffix else name)
-        material = material if splats.albedo is None else material.white()
+    source = material_of_scene(file)
+    if isinstance(source, Table):
+        material = read_material(source)
     else:
-        material = read_material(file.table("material", MATERIAL_TABLES))
+        material = file.make(load_material, source)
+        material = material if splats.albedo is None else material.white()
     lights = [light_of(light, material.channels) for light in file.tables("lights", LIGHT_ENTRIES)]
     table = file.table("settings", ("bounces", "diffusion"))
     diffuser = DIFFUSERS[table.one_of("diffusion", DIFFUSERS, "clusters")]
@@ -90,6 +91,14 @@ def scene_table(path: StrPath) -> Table:
     table = Table(path, "", record.get("scene"), _TABLES)
     table.entries.setdefault("settings", {})
     return table
+
+
+def material_of_scene(file: Table) -> StrPath | Table:
+    """Return the name, path or tables of the material in a scene's file."""
+    name = file.entries.get("material")
+    if not isinstance(name, str):
+        return file.table("material", MATERIAL_TABLES)
+    return file.folder / name if Path(name).suffix else name
 
 
 def save_scene(

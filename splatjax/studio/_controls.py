@@ -1,7 +1,7 @@
 """What can be turned in a studio."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +10,9 @@ from splatjax.scene import AbstractLight, EnvironmentLight
 
 LAYERS = ("beauty", "diffuse", "specular", "albedo", "irradiance", "shadow")
 SURFACE = ("eta", "specular", "roughness")
+# What a medium and a skin are changed by, and derivatives are taken in.
+COEFFICIENTS = {"sigma_a": "absorption", "sigma_s_prime": "scattering"}
+PIGMENTS = ("melanin", "blood", "oxygenation", "eumelanin", "bilirubin", "thickness", "scattering")
 # Fields of lights that are points or directions.
 _VECTORS = ("direction", "position", "origin", "center", "edges")
 
@@ -22,6 +25,7 @@ class Controls:
 
     - `eye`, `target`: of the camera, mm.
     - `sigma_a`, `sigma_s_prime`: per channel, 1/mm; empty for a material without a medium.
+    - `skin`: names and values of a `Skin`; empty without one.
     - `eta`, `specular`, `roughness`: as those of a `Material`; `eta` is the medium's too.
     - `scale`: factor on the weights.
     - `turn`: of the lights about the vertical axis, degrees.
@@ -37,6 +41,7 @@ class Controls:
     eta: float
     specular: float
     roughness: float
+    skin: tuple[tuple[str, float], ...] = ()
     scale: float = 1.0
     turn: float = 0.0
     light_stops: tuple[float, ...] = ()
@@ -44,8 +49,8 @@ class Controls:
     exposure: float = 0.0
 
     @property
-    def coefficients(self) -> tuple[tuple[float, ...], tuple[float, ...], float]:
-        return self.sigma_a, self.sigma_s_prime, self.eta
+    def coefficients(self) -> Hashable:
+        return self.sigma_a, self.sigma_s_prime, self.skin, self.eta
 
 
 def rotation_about_y(degrees: float) -> np.ndarray:

@@ -3,7 +3,6 @@ which programs are also compiled, so that the page answers meanwhile.
 """
 
 import contextlib
-import dataclasses
 import importlib.util
 import io
 import threading
@@ -16,12 +15,13 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from splatjax._display import to_display
-from splatjax._format import channel_names, format_numbers
+from splatjax._format import channel_names
 from splatjax.cache import COMPILING
 from splatjax.inverse import Observation
 from splatjax.scattering import Medium
 
-from ._controls import LAYERS, Controls
+from ._controls import Controls
+from ._panel import Panel
 from ._saving import SUFFIXES, AsFile, save
 from ._search import Search
 from ._session import Session
@@ -29,17 +29,6 @@ from ._session import Session
 _STILL = 0.15  # s without a change, after which the whole picture is computed
 _NEAR = 1e-5  # relative, of cameras that are the same
 _QUALITY = 92  # of JPEG
-_MOST, _STOPS = 4.0, 8.0  # powers of 2, of coefficients and of light
-_SLIDERS = {
-    "turn": ("turn lights, °", -180.0, 180.0),
-    "exposure": ("exposure, stops", -_STOPS, _STOPS),
-    "scale": ("diffuse", 0.0, 1.0),
-    "specular": ("specular", 0.0, 1.0),
-    "roughness": ("roughness", 0.05, 1.0),
-    "eta": ("eta", 1.0, 2.5),
-}
-_FACTORS = {"sigma_a": "absorption", "sigma_s_prime": "scattering"}
-_COLORS = ("#c0392b", "#27853f", "#2c5aa0")
 
 
 def check_viser() -> None:
@@ -123,53 +112,16 @@ class Page:
         self._server.stop()
 
     def _add_controls(self, gui: Any) -> None:
-        start, curves = self._session.start, self._session.curves(self._session.start)
         gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         self._status = gui.add_markdown("starting ...")
         gui.add_button("first view").on_click(lambda _: self._look_again())
         buttons = gui.add_button_group("save", tuple(SUFFIXES))
         buttons.on_click(lambda event: self._change(event.target.value))
-        self._handles = handles = {"layer": gui.add_dropdown("layer", LAYERS)}
-        for name, (label, low, high) in _SLIDERS.items():
-            value = getattr(start, name)
-            low, high = min(low, value), max(high, value)
-            handles[name] = gui.add_slider(label, low, high, 0.01, value)
-        lights = self._session.own.lights if len(start.light_stops) > 1 else ()
-        for number, light in enumerate(lights):
-            label = f"{type(light).__name__.removesuffix('Light').lower()} {number + 1}, stops"
-            handles[f"light {number}"] = gui.add_slider(label, -_STOPS, _STOPS, 0.01, 0.0)
-        channels = self._session.own.material.channels
-        names = ("all", *channel_names(channels)) if start.sigma_a else ()
-        for field, label in _FACTORS.items() if names else ():
-            with gui.add_folder(f"{label}, by powers of 2", expand_by_default=False):
-                for number, name in enumerate(names):
-                    handles[f"{field} {number}"] = gui.add_slider(name, -_MOST, _MOST, 0.01, 0.0)
-        for handle in handles.values():
-            handle.on_update(lambda _: self._change())
-        self._numbers = gui.add_markdown("")
+        self._panel = Panel(gui, self._session, self._change)
         self._pixel = gui.add_markdown("click the picture for the parts of a pixel")
         if self._observations:
             self._add_search(gui)
-        profiles, hidden = len(curves) - 1 - channels, {"points": {"show": False}}
-        series = [
-            {"stroke": _COLORS[i % channels % 3] + opacity, "width": width, **hidden}
-            for i in range(profiles + channels)
-            for opacity, width in [("60", 6) if i < profiles else ("", 1.5)]
-        ]
-        self._plot = gui.add_uplot(
-            tuple(curves),
-            ({"label": "r"}, *series),
-            title="r R(r) over r in mm, and its fit (narrow)",
-            scales={
-                "x": {
-                    "time": False,
-                    "distr": 3,
-                    "range": (float(curves[0][0]), float(curves[0][-1])),
-                }
-            },
-            legend={"show": False},
-            aspect=1.8,
-        )
+        self._panel.add_plot(gui)
 
     def _add_search(self, gui: Any) -> None:
         self._search = Search(self._session, self._observations, self._follow)
@@ -191,11 +143,8 @@ class Page:
     def _follow(self, stage: str, medium: Medium | None) -> None:
         """Show a stage of the search: sliders and picture become those of its medium."""
         self._stage.content = f"```\n{stage}\n```"
-        for field in _FACTORS if medium is not None else ():
-            start = np.asarray(getattr(self._session.start, field))
-            powers = np.log2(np.asarray(getattr(medium, field)) / start)
-            for number, power in enumerate([0.0, *np.clip(powers, -_MOST, _MOST).tolist()]):
-                self._handles[f"{field} {number}"].value = power
+        if medium is not None:
+            self._panel.set_medium(medium)
 
     def _compare(self, picture: np.ndarray) -> None:
         """Show the first picture, and half the difference of another of the same camera to it."""
@@ -218,17 +167,7 @@ class Page:
         self._changed.set()
 
     def _controls(self) -> Controls:
-        values = {name: handle.value for name, handle in self._handles.items()}
-        start, (eye, target) = self._session.start, self._place.tolist()
-        changed = {name: value for name, value in values.items() if " " not in name}
-        for field in _FACTORS:
-            changed[field] = tuple(
-                number * 2 ** (values[f"{field} 0"] + values[f"{field} {channel}"])
-                for channel, number in enumerate(getattr(start, field), 1)
-            )
-        stops = tuple(value for name, value in values.items() if name.startswith("light "))
-        changed["light_stops"] = stops or start.light_stops
-        return dataclasses.replace(start, eye=tuple(eye), target=tuple(target), **changed)
+        return self._panel.controls(self._place)
 
     def _join(self, client: Any) -> None:
         client.camera.on_update(self._look)
@@ -303,10 +242,7 @@ class Page:
         """Show a state, and write what is to be saved; return what to report."""
         session, written = self._session, list[Path]()
         self._show(session.draft(controls))
-        self._plot.data = tuple(session.curves(controls))
-        rows = [(label, getattr(controls, field)) for field, label in _FACTORS.items()]
-        shown = [f"{label}: {format_numbers(row, '.4g')} /mm" for label, row in rows if row]
-        self._numbers.content = "  \n".join(shown)
+        self._panel.show(controls)
         if not self._saves and self._changed.wait(_STILL):
             return ""
         picture = session.picture(controls)

@@ -1,5 +1,8 @@
 """What a session computes while a slider moves: one compiled program each."""
 
+from dataclasses import replace
+from typing import TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,8 +11,9 @@ from jaxtyping import Array, Float
 from splatjax import fitting as _fitting
 from splatjax.gaussians import SumOfGaussians
 from splatjax.render import DiffusionBasis
-from splatjax.scattering import AngularLaw, Medium
+from splatjax.scattering import AngularLaw, Medium, Skin
 
+Optics: TypeAlias = Medium | Skin
 _WEIGHTS = _fitting.NonNegativeWeights(_fitting.FixedTotalReflectance())
 
 
@@ -36,58 +40,60 @@ def light_of_gaussians(
 @eqx.filter_jit
 def changes_with_coefficients(
     model: _fitting.AbstractModel,
-    medium: Medium,
+    optics: Optics,
+    names: tuple[str, ...],
     variances: Float[Array, " gaussians"],
     has_color: bool,
     basis: DiffusionBasis,
     place: tuple[int, int],
 ) -> list[Float[Array, " channels"]]:
-    """Differentiate the radiance of a pixel with respect to the logarithms of absorption and of
-    scattering. No channel depends on the coefficients of another.
+    """Differentiate the radiance of a pixel with respect to the logarithms of fields. No channel
+    depends on the coefficients of another.
     """
 
-    def radiance(sigma_a, sigma_s_prime):
-        gaussians = weights_of(model, Medium(sigma_a, sigma_s_prime, medium.eta), variances)
-        gaussians = gaussians if has_color else gaussians.white()
-        return jnp.sum(light_of_gaussians(basis, gaussians, place), axis=0)
+    def change(name: str) -> Float[Array, " channels"]:
+        def radiance(value):
+            gaussians = weights_of(model, replace(optics, **{name: value}), variances)
+            gaussians = gaussians if has_color else gaussians.white()
+            return jnp.sum(light_of_gaussians(basis, gaussians, place), axis=0)
 
-    coefficients = medium.sigma_a, medium.sigma_s_prime
-    none = jnp.zeros_like(medium.sigma_a)
-    directions = (medium.sigma_a, none), (none, medium.sigma_s_prime)
-    return [jax.jvp(radiance, coefficients, along)[1] for along in directions]
+        value = getattr(optics, name)
+        return jax.jvp(radiance, (value,), (value,))[1]
+
+    return [change(name) for name in names]
 
 
 @eqx.filter_jit
 def weights_of(
-    model: _fitting.AbstractModel, medium: Medium, variances: Float[Array, " gaussians"]
+    model: _fitting.AbstractModel, optics: Optics, variances: Float[Array, " gaussians"]
 ) -> SumOfGaussians:
     """Fit the weights to coefficients, for held variances."""
-    profile = model.profile(medium)
+    profile = model.profile(optics)
     return _fitting.fit_weights(profile, variances, weights=_WEIGHTS, rule=model.rule)
 
 
 @eqx.filter_jit
 def variances_and_angles(
-    model: _fitting.AbstractModel, medium: Medium, variances: Float[Array, " gaussians"]
+    model: _fitting.AbstractModel, optics: Optics, variances: Float[Array, " gaussians"]
 ) -> tuple[Float[Array, " gaussians"], AngularLaw | None]:
     """Find variances near given ones, which stay where none better is found; and the angles."""
-    profile, start = model.profile(medium), _fitting.GivenVariances(variances)
+    profile, start = model.profile(optics), _fitting.GivenVariances(variances)
     fitted = _fitting.fit_gaussians(
         profile, len(variances), weights=_WEIGHTS, start=start, rule=model.rule, throw=False
     )
     held = _fitting.fit_weights(profile, variances, weights=_WEIGHTS, rule=model.rule)
     error = _fitting.relative_error(profile, held, model.rule)
     is_better = jnp.max(fitted.error) < jnp.max(error)
-    return jnp.where(is_better, fitted.gaussians.variances, variances), model.angles(medium)
+    return jnp.where(is_better, fitted.gaussians.variances, variances), model.angles(optics)
 
 
 @eqx.filter_jit
 def profile_curves(
     model: _fitting.AbstractModel,
-    medium: Medium | None,
+    optics: Optics | None,
     gaussians: SumOfGaussians,
     radii: Float[Array, " radii"],
 ) -> list[Float[Array, " radii"]]:
     """Compute the profile, where there are coefficients, and the sum of Gaussians, times r."""
-    profiles = [gaussians] if medium is None else [model.profile(medium), gaussians]
+    profiles = [gaussians] if optics is None else [model.profile(optics), gaussians]
     return [radii * row for profile in profiles for row in profile(radii).T]

@@ -4,7 +4,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from splatjax.io import atomic_path, save_material, save_scene, write_exr, write_png, write_toml
+from splatjax.io import (
+    atomic_path,
+    plain_material,
+    save_material,
+    save_scene,
+    write_exr,
+    write_png,
+    write_toml,
+)
+from splatjax.scattering import Skin
 
 from ._controls import Controls
 from ._session import Session
@@ -44,9 +53,11 @@ def save(
     """
     session.picture(controls)  # whose variances and angles are those of the coefficients
     scene, camera = session.scene(controls), session.camera(controls)
-    record: dict[str, Any] | None = None
+    optics, record = session.optics(controls), dict[str, Any]()
+    skin = optics if isinstance(optics, Skin) else None
     if as_file is not None:
         record = as_file(folder, scene.material, scene.lights, camera)
+        record["material"] = plain_material(scene.material, skin)
     taken = {path.stem for path in folder.iterdir()}
     name = next(name for n in range(len(taken) + 1) if (name := f"studio_{n:03}") not in taken)
     paths = [folder / f"{name}{suffix}" for suffix in SUFFIXES[kind]]
@@ -57,11 +68,12 @@ def save(
             paths[0],
             session.frame(controls),
             variances=scene.material.gaussians.variances.tolist(),
-            manifest=record and {"scene": record},
+            manifest={"scene": record} if record else None,
             camera=camera,
         )
     elif kind == "material":
-        save_material(scene.material, paths[0], source={"provenance": "the studio of splatjax"})
+        source = {"provenance": "the studio of splatjax"}
+        save_material(scene.material, paths[0], profile=skin, source=source)
     else:
         if record:
             write_toml(paths[0], record)

@@ -13,6 +13,7 @@ from splatjax import fitting as _fitting
 from splatjax._display import to_display
 from splatjax._records import Numbers
 from splatjax.gaussians import SumOfGaussians
+from splatjax.io import spectrum_to_rgb
 from splatjax.render import (
     DiffusionBasis,
     Plan,
@@ -23,11 +24,20 @@ from splatjax.render import (
     render,
     transfer,
 )
-from splatjax.scattering import Medium
+from splatjax.scattering import Medium, Skin
 from splatjax.scene import Camera, EnvironmentLight, Frame, Scene, Splats
 
-from ._controls import SURFACE, Controls, brightened, rotation_about_y, turned
+from ._controls import (
+    COEFFICIENTS,
+    PIGMENTS,
+    SURFACE,
+    Controls,
+    brightened,
+    rotation_about_y,
+    turned,
+)
 from ._programs import (
+    Optics,
     blend,
     changes_with_coefficients,
     light_of_gaussians,
@@ -76,7 +86,7 @@ class Session:
       alone. To turn an environment quickly, give it fixed `directions`.
     - `camera`: of the first picture.
     - `target`: at which it looks, mm.
-    - `model`: of coefficients that were changed.
+    - `skin`: from which the material was fitted; its pigments change instead of a medium.
 
     **Attributes:**
 
@@ -92,9 +102,9 @@ class Session:
         target: Numbers,
         *,
         exposure: float = 0.0,
-        model: _fitting.AbstractModel = _fitting.TransportModel(),
+        skin: Skin | None = None,
     ):
-        material, medium = scene.material, scene.material.medium
+        material, medium = scene.material, scene.material.medium if skin is None else None
         if material.single_scattering is not None:
             raise ValueError(
                 "the material has single scattering, beside which less light enters as the "
@@ -102,14 +112,18 @@ class Session:
             )
         coefficients = () if medium is None else (medium.sigma_a, medium.sigma_s_prime)
         absorption, scattering = map(_plain, coefficients or ((), ()))
-        eta, specular, roughness = (round(float(getattr(material, name)), 6) for name in SURFACE)
+        eta, specular, roughness = (_rounded(getattr(material, name)) for name in SURFACE)
         places = _plain(camera.position), _plain(target)
         self.start = Controls(
             *(*places, absorption, scattering, eta, specular, roughness),
+            skin=tuple((name, _rounded(getattr(skin, name))) for name in PIGMENTS if skin),
             light_stops=(0.0,) * len(scene.lights),
             exposure=exposure,
         )
-        self.own, self.model = scene, model
+        self.own, self.skin = scene, skin
+        self.model: _fitting.AbstractModel = _fitting.TransportModel()
+        if skin is not None:
+            self.model = _fitting.SkinModel(spectrum_to_rgb(skin.wavelengths))
         self.fov = float(np.degrees(2 * np.arctan(0.5 / camera.focal_length)))
         few = jax.tree.map(lambda leaf: leaf[::_MERGED], scene.splats)
         larger = {"radii": few.radii * _MERGED**0.5, "areas": few.areas * _MERGED}
@@ -152,20 +166,22 @@ class Session:
 
         **Returns:** per channel, its radiance, its highlight, and the light that each Gaussian
         spreads, by its width; where there are coefficients, also the change of the radiance with
-        the logarithms of absorption and of scattering, for held variances.
+        the logarithms of absorption and of scattering, or of melanin and blood, for held variances.
         """
         basis, gaussians = self._basis(self._full, controls), self._gaussians(controls)
-        place, medium = (row, column), self._medium(controls)
+        place, optics = (row, column), self.optics(controls)
         light = light_of_gaussians(basis, gaussians, place)
         highlight = controls.specular * basis.specular[place]
         parts = {"radiance": jnp.sum(light, axis=0) + highlight, "highlight": highlight}
         widths = np.sqrt(gaussians.variances).tolist()
         parts |= {f"{width:.2g} mm": of for width, of in zip(widths, light, strict=True)}
-        if medium is not None:
-            inputs = self.model, medium, self._variances, self._has_color
-            changes = changes_with_coefficients(*inputs, basis, place)
-            names = "per ln absorption", "per ln scattering"
-            parts |= {name: controls.scale * of for name, of in zip(names, changes, strict=True)}
+        if optics is not None:
+            names = tuple(COEFFICIENTS) if isinstance(optics, Medium) else PIGMENTS[:2]
+            inputs = self.model, optics, names, self._variances, self._has_color
+            for name, of in zip(
+                names, changes_with_coefficients(*inputs, basis, place), strict=True
+            ):
+                parts[f"per ln {COEFFICIENTS.get(name, name)}"] = controls.scale * of
         return {name: np.asarray(values, np.float64) for name, values in parts.items()}
 
     def scene(self, controls: Controls, body: _Body | None = None, **surface: float) -> Scene:
@@ -175,9 +191,10 @@ class Session:
             self.own.material,
             gaussians=self._gaussians(controls),
             angles=self._angles,
-            medium=self._medium(controls),
             **surface,
         )
+        if isinstance(optics := self.optics(controls), Medium):
+            material = dataclasses.replace(material, medium=optics)
         lights = brightened(turned(self.own.lights, controls.turn), controls.light_stops)
         return Scene((body or self._full).splats, lights, material)
 
@@ -192,27 +209,29 @@ class Session:
         **Returns:** radii (mm); of each channel the profile times the radius, 1/mm, where there are
         coefficients; and the same of the Gaussians.
         """
-        medium, gaussians = self._medium(controls), self._fitted(controls)
+        optics, gaussians = self.optics(controls), self._fitted(controls)
         widest = 3 * np.sqrt(np.max(self.own.material.gaussians.variances))
         radii = jnp.asarray(np.geomspace(0.01 * widest, widest, 120), self._variances.dtype)
-        rows = profile_curves(self.model, medium, gaussians, radii)
+        rows = profile_curves(self.model, optics, gaussians, radii)
         return [np.asarray(row, np.float64) for row in (radii, *rows)]
 
-    def _medium(self, controls: Controls) -> Medium | None:
-        medium = self.own.material.medium
-        if medium is None or controls.coefficients == self.start.coefficients:
-            return medium
-        rows = controls.sigma_a, controls.sigma_s_prime, [controls.eta] * medium.channels
+    def optics(self, controls: Controls) -> Optics | None:
+        """Return the medium or the skin of a state, if there is one."""
+        own = self.own.material.medium if self.skin is None else self.skin
+        if own is None or controls.coefficients == self.start.coefficients:
+            return own
+        if self.skin is not None:
+            return dataclasses.replace(self.skin, eta=controls.eta, **dict(controls.skin))
+        rows = controls.sigma_a, controls.sigma_s_prime, [controls.eta] * own.channels
         return Medium(*(jnp.asarray(row, self._variances.dtype) for row in rows))
 
     def _fitted(self, controls: Controls) -> SumOfGaussians:
         """Return the material's own Gaussians, or those that stand for changed coefficients."""
-        material, medium = self.own.material, self._medium(controls)
-        if medium is None or (
-            medium is material.medium and self._variances is material.gaussians.variances
-        ):
-            return material.gaussians
-        return weights_of(self.model, medium, self._variances)
+        gaussians, optics = self.own.material.gaussians, self.optics(controls)
+        is_own = optics is self.optics(self.start) and self._variances is gaussians.variances
+        if optics is None or is_own:
+            return gaussians
+        return weights_of(self.model, optics, self._variances)
 
     def _gaussians(self, controls: Controls) -> SumOfGaussians:
         gaussians = self._fitted(controls)
@@ -227,11 +246,11 @@ class Session:
         """Let variances and angles follow the coefficients."""
         if controls.coefficients == self._settled:
             return
-        material, medium = self.own.material, self._medium(controls)
+        material, optics = self.own.material, self.optics(controls)
         held, self._angles = self._variances, material.angles
         self._variances = material.gaussians.variances
-        if medium is not None and medium is not material.medium:
-            self._variances, angles = variances_and_angles(self.model, medium, held)
+        if optics is not None and optics is not self.optics(self.start):
+            self._variances, angles = variances_and_angles(self.model, optics, held)
             self._angles = angles if self._has_color else None
         self._settled, self._fits = controls.coefficients, self._fits + 1
         if np.max(np.abs(np.log(self._variances / self._planned))) > np.log(_PLANNED):
@@ -296,3 +315,7 @@ class Session:
 
 def _plain(values: Numbers) -> tuple[float, ...]:
     return tuple(np.asarray(values, np.float64).tolist())
+
+
+def _rounded(value: Numbers) -> float:
+    return round(float(np.asarray(value)), 6)

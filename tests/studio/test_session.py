@@ -92,6 +92,52 @@ def test_coefficients_are_fitted_as_a_material_is(studio, states):
     assert [row.shape for row in rows] == [radii.shape] * 6
 
 
+@pytest.fixture(scope="module")
+def skin_studio(studio):
+    material, skin = sj.load_material("skin_light"), sj.io.load_skin("skin_light")
+    scene = dataclasses.replace(studio.own, material=material)
+    return Session(scene, studio.camera(studio.start), [0, 0, 0], skin=skin)
+
+
+def test_pigments_change_skin_as_a_fit_does(skin_studio, tmp_path):
+    """More melanin is darker and more blood is redder; files hold the changed skin."""
+    start = skin_studio.start
+    own = skin_studio.scene(start).material
+    assert eqx.tree_equal(own.gaussians, sj.load_material("skin_light").gaussians)
+    totals = {}
+    for name, value in (("melanin", 0.2), ("blood", 0.05)):
+        controls = with_(start, skin=tuple({**dict(start.skin), name: value}.items()))
+        assert skin_studio.picture(controls).max() > 50
+        material = skin_studio.scene(controls).material
+        skin = dataclasses.replace(sj.io.load_skin("skin_light"), **{name: value})
+        colors = skin.profile().total_reflectance() @ sj.io.spectrum_to_rgb(skin.wavelengths)
+        totals[name] = material.gaussians.total_reflectance()
+        np.testing.assert_allclose(totals[name], colors, rtol=1e-4)
+        assert not eqx.tree_equal(material.angles, own.angles)
+    before = own.gaussians.total_reflectance()
+    assert np.all(totals["melanin"] < 0.8 * before)
+    ratio = totals["blood"] / before
+    assert ratio[0] > 1.2 * ratio[1]
+    for path in save(skin_studio, controls, tmp_path, "material"):
+        assert eqx.tree_equal(sj.io.load_skin(path), skin_studio.optics(controls))
+
+
+def test_a_pixel_of_skin_changes_with_its_pigments(skin_studio):
+    start = skin_studio.start
+    skin_studio.picture(start)
+    parts, place = skin_studio.pixel(start, 25, 15), (25, 15)
+    for name in ("melanin", "blood"):
+        values = dict(start.skin)
+        ends = [
+            skin_studio.pixel(
+                with_(start, skin=tuple({**values, name: f * values[name]}.items())), *place
+            )
+            for f in (np.exp(-0.05), np.exp(0.05))
+        ]
+        difference = (ends[1]["radiance"] - ends[0]["radiance"]) / 0.1
+        np.testing.assert_allclose(parts[f"per ln {name}"], difference, rtol=0.05, atol=2e-4)
+
+
 def test_a_pixel_is_the_sum_of_its_parts(studio, states):
     """Its changes with the coefficients are differences of pictures of held variances."""
     controls = states["absorption"]
@@ -197,8 +243,8 @@ def test_a_scene_file_opens_and_what_is_saved_is_one(tmp_path, capsys):
     (tmp_path / "maps").mkdir()
     write_picture(tmp_path / "maps" / "sky.exr", np.asarray(sj.scene.overcast_sky()))
     page = Studio(splats=scene, output=looks, port=18_070).page()
-    page._handles["light 1"].value = -2.0
-    page._handles["turn"].value = 30.0
+    page._panel.handles["light 1"].value = -2.0
+    page._panel.handles["turn"].value = 30.0
     page._change("scene", "EXR")
     wait_until(lambda: "studio_001.exr" in page._status.content)
     page.close()
@@ -281,7 +327,7 @@ def test_only_this_computer_reaches_the_page_and_it_writes_to_one_folder(page, t
     assert page.url in page._repr_html_()  # as a notebook shows it
     assert page._server.get_host() == "127.0.0.1"
     assert page._server.request_share_url() is None
-    page._handles["sigma_a 0"].value = 1.0
+    page._panel.handles["sigma_a 0"].value = 1.0
     page._change("PNG", "material")
     names = ["studio_000.png", "studio_001.toml"]
     wait_until(lambda: len([*tmp_path.rglob("studio_*.*")]) == len(names))
@@ -312,7 +358,7 @@ def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp
     wait_until(lambda: "stopped" in searching._stage.content)
     press(searching._controls())
     wait_until(lambda: "error bars" in searching._stage.content)
-    powers = [searching._handles[f"sigma_a {channel}"].value for channel in (1, 2, 3)]
+    powers = [searching._panel.handles[f"sigma_a {channel}"].value for channel in (1, 2, 3)]
     np.testing.assert_allclose(powers, np.log2(1.5), atol=0.06)
     wait_until(lambda: searching._status.content == "")
     difference = searching._compared.image[:, SIDE:].astype(int) - 128
@@ -350,13 +396,15 @@ def test_a_browser_picks_drags_orbits_and_saves(page, tmp_path):
         for folder in ("absorption", "scattering"):
             window.get_by_text(f"{folder}, by powers of 2").click()
         sliders = window.get_by_role("slider")
-        moving = {name: handle.value for name, handle in page._handles.items() if name != "layer"}
+        moving = {
+            name: handle.value for name, handle in page._panel.handles.items() if name != "layer"
+        }
         wait_until(lambda: sliders.count() == len(moving))
         for number in range(len(moving)):
             sliders.nth(number).focus()
             window.keyboard.press("ArrowLeft")
             window.wait_for_timeout(100)
-        wait_until(lambda: all(page._handles[name].value < moving[name] for name in moving))
+        wait_until(lambda: all(page._panel.handles[name].value < moving[name] for name in moving))
         window.reload()
         window.wait_for_selector("text=turn lights")
         shows_the_picture()
