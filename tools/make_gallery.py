@@ -26,21 +26,16 @@ FOLDER = Path(__file__).resolve().parents[1] / "out" / "gallery"
 HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 
 
-STUDIO = sj.scene.studio()
-
-
-def dim(strength, image=STUDIO) -> sj.EnvironmentLight:
-    """Return a studio, or another environment, of some strength."""
-    return sj.EnvironmentLight(image, strength=strength)
+def dim(strength) -> sj.EnvironmentLight:
+    """Return a studio of some strength."""
+    return sj.EnvironmentLight(sj.scene.studio(), strength=strength)
 
 
 def sun(x, y, z, strength=1.0, tint=(1.0, 1.0, 1.0)) -> sj.DirectionalLight:
     """Return a light that comes from a direction; of strength 1 it shows a white diffuser with
     radiance 1.
     """
-    irradiance = jnp.asarray(tint, float) * (strength * jnp.pi)
-    towards = -jnp.asarray([x, y, z], float)
-    return sj.DirectionalLight(towards, irradiance)
+    return sj.DirectionalLight((-x, -y, -z), np.multiply(tint, strength * np.pi))
 
 
 def fitted(profile: sj.gaussians.AbstractProfile, eta: float, specular: float, roughness: float):
@@ -56,21 +51,12 @@ def transported(medium: sj.Medium, specular: float, roughness: float) -> sj.Mate
         medium = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), medium)
         profile, angles = model.profile(medium), model.angles(medium)
         gaussians = sj.fit_gaussians(profile, 6, weights=HELD, rule=model.rule).gaussians
-        eta = medium.eta[0]
-        made = sj.Material(
-            gaussians, eta=eta, specular=specular, roughness=roughness, angles=angles
-        )
+        made = sj.Material(gaussians, medium.eta[0], specular, roughness, angles=angles)
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), made)
-
-
-def medium(sigma_a, sigma_s_prime, eta: float) -> sj.Medium:
-    """Return a medium of red, green and blue, 1/mm."""
-    return sj.Medium(jnp.asarray(sigma_a), jnp.asarray(sigma_s_prime), jnp.full(3, eta))
 
 
 def picture(splats, lights, material, eye, target, fov, side, exposure=0.0) -> np.ndarray:
     """Render before a dark wall, lighter below, and return the picture encoded for a display."""
-    eye, target = jnp.asarray(eye, float), jnp.asarray(target, float)
     camera = sj.Camera.look_at(eye, target, fov=fov, width=side, height=side)
     frame = sj.render(sj.Scene(splats, lights, material), camera)
     return before_a_wall(frame.beauty, frame.coverage, exposure)
@@ -126,10 +112,8 @@ def skin(head, side, eye, target, fov, lights, exposure=0.4, scattering=True) ->
 
 def marble_bust(_: sj.Splats, side: int) -> np.ndarray:
     """The bust in marble's own color, without its map."""
-    bust = sj.bust(250_000)
-    plain = sj.Splats(bust.centers, bust.normals, bust.radii, bust.areas)
-    marble = sj.load_material("marble")
-    return picture(plain, [dim(1.0)], marble, (230, 20, 640), (0, -40, 0), 30.0, side, -0.3)
+    bust, marble = sj.bust(250_000).without_maps(), sj.load_material("marble")
+    return picture(bust, [dim(1.0)], marble, (230, 20, 640), (0, -40, 0), 30.0, side, -0.3)
 
 
 def milk_glass(_: sj.Splats, side: int) -> np.ndarray:
@@ -144,7 +128,7 @@ def milk_glass(_: sj.Splats, side: int) -> np.ndarray:
     vertices, faces = lathe(outline, 360)
     angle = np.arctan2(vertices[:, 0], vertices[:, 2])
     vertices[:, [0, 2]] *= (1 + 0.03 * np.cos(14 * angle))[:, None]
-    glass = medium([0.0015, 0.002, 0.0028], [1.6, 1.9, 2.3], 1.5)
+    glass = sj.Medium([0.0015, 0.002, 0.0028], [1.6, 1.9, 2.3], 1.5)
     opal = transported(glass, 1.0, 0.07)
     lamp = sj.PointLight(jnp.asarray([0.0, 60.0, 0.0]), jnp.asarray([7000.0, 4000.0, 1800.0]))
     lights = lamp, dim([0.3, 0.36, 0.42])
@@ -174,8 +158,8 @@ def jade(_: sj.Splats, side: int) -> np.ndarray:
     rims = [np.exp(-(((radius - rim) / 0.9) ** 4)) for rim in (outer - 1.4, inner + 1.4)]
     carved = np.maximum(raised, sum(rims)) * (np.abs(z) > 0.9 * half)
     vertices = np.stack([x, y, z + np.sign(z) * grain * carved], axis=-1)
-    crust = sj.Layer(medium([0.04, 0.06, 0.2], [3.0, 3.2, 3.4], 1.55), jnp.asarray(0.4))
-    stone = sj.Layer(medium([0.16, 0.022, 0.1], [0.9, 1.0, 1.1], 1.55), jnp.asarray(jnp.inf))
+    crust = sj.Layer(sj.Medium([0.04, 0.06, 0.2], [3.0, 3.2, 3.4], 1.55), jnp.asarray(0.4))
+    stone = sj.Layer(sj.Medium([0.16, 0.022, 0.1], [0.9, 1.0, 1.1], 1.55), jnp.asarray(jnp.inf))
     material = fitted(sj.LayeredMultipole([crust, stone]), 1.6, 0.9, 0.12)
     lights = (
         sun(0.5, 0.5, -1.0, 3.0, (1.0, 0.95, 0.85)),
@@ -194,7 +178,7 @@ def wax(_: sj.Splats, side: int) -> np.ndarray:
     waves = ((3.0, 1, 0.6), (1.4, 3, 0.0), (0.7, 7, 1.0))
     rim = sum(height * np.sin(number * angle + phase) for height, number, phase in waves)
     vertices[:, 1] += np.clip((vertices[:, 1] - 50) / 30, 0, 1) * rim
-    candle = medium([0.0006, 0.0022, 0.009], [0.9, 1.0, 1.15], 1.44)
+    candle = sj.Medium([0.0006, 0.0022, 0.009], [0.9, 1.0, 1.15], 1.44)
     paraffin = transported(candle, 0.6, 0.2)
     flame = sj.PointLight(jnp.asarray([0.0, 69.0, 0.0]), jnp.asarray([5200.0, 3400.0, 1700.0]))
     lights = flame, dim([0.06, 0.075, 0.1])
@@ -206,10 +190,9 @@ def inverse(_: sj.Splats, side: int) -> np.ndarray:
     """A photograph, the same body under the coefficients that the search starts from, and under
     those that it finds.
     """
-    bust = sj.bust(20_000)
-    splats = sj.Splats(bust.centers, bust.normals, bust.radii, bust.areas).scaled(0.2)
+    splats = sj.bust(20_000).without_maps().scaled(0.2)
     lights = sun(-0.9, 0.5, 0.45), sun(0.9, 0.2, -0.6, 0.6)
-    eye, target, size = jnp.asarray([46.0, 4, 128]), jnp.asarray([0.0, -8, 0]), 3 * side // 8
+    eye, target, size = (46, 4, 128), (0, -8, 0), 3 * side // 8
     camera = sj.Camera.look_at(eye, target, fov=30.0, width=size, height=size)
 
     def render(medium: sj.Medium) -> sj.Frame:

@@ -14,7 +14,6 @@ from ._lighting import (
     NormalFields as NormalFields,
     PhongSplats as PhongSplats,
 )
-from ._methods import exitance as exitance
 from ._mesh_light import (
     mesh_light as mesh_light,
     MeshLight as MeshLight,
@@ -37,6 +36,7 @@ from ._mesh_raster import (
 from ._methods import (
     deferred_splatting as deferred_splatting,
     elliptical_points as elliptical_points,
+    exitance as exitance,
     ewa_splatting as ewa_splatting,
     phong_splatting as phong_splatting,
 )
@@ -64,10 +64,10 @@ from ._textured_mesh import (
     surface_points as surface_points,
     TexturedMesh as TexturedMesh,
 )
-from ._thinned import ThinnedDiffuser as ThinnedDiffuser
 from ._thinning import (
     layer_contrast as layer_contrast,
     splats_that_suffice as splats_that_suffice,
+    ThinnedDiffuser as ThinnedDiffuser,
     thinning_error as thinning_error,
 )
 from ._translucent import (

@@ -14,10 +14,8 @@ from ._kernels import DiscKernel, DiscOrPixelKernel, EwaKernel
 from ._lighting import LightAtPixels, NormalFields
 from ._nearest import NearestRasterizer
 
-_DEFAULTS = RenderSettings()
 
-
-def elliptical_points(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+def elliptical_points(settings: RenderSettings = RenderSettings()) -> RenderSettings:
     """Return settings that draw elliptical points: the nearest splat wins, and has one color, as in
     flat shading.
 
@@ -26,7 +24,7 @@ def elliptical_points(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
     return replace(settings, rasterizer=NearestRasterizer(), lighting=LightAtSplats())
 
 
-def ewa_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+def ewa_splatting(settings: RenderSettings = RenderSettings()) -> RenderSettings:
     """Return settings that splat surfaces with the elliptical weighted average: the splat's kernel
     blurred by the pixel's.
 
@@ -38,7 +36,7 @@ def ewa_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
     return replace(settings, rasterizer=BlendingRasterizer(EwaKernel()), lighting=LightAtPixels())
 
 
-def phong_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+def phong_splatting(settings: RenderSettings = RenderSettings()) -> RenderSettings:
     """Return settings for Phong splatting: normals vary linearly within each splat, and nothing is
     filtered in the picture.
 
@@ -47,11 +45,10 @@ def phong_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
 
     **Source:** Botsch et al. 2004, "Phong Splatting".
     """
-    rasterizer = BlendingRasterizer(DiscKernel())
-    return replace(settings, rasterizer=rasterizer, lighting=NormalFields())
+    return replace(settings, rasterizer=BlendingRasterizer(DiscKernel()), lighting=NormalFields())
 
 
-def deferred_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+def deferred_splatting(settings: RenderSettings = RenderSettings()) -> RenderSettings:
     """Return settings for high-quality deferred splatting: attributes are blended, with a filter
     for small splats, then shaded.
 
@@ -59,8 +56,9 @@ def deferred_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
 
     **Source:** Botsch et al. 2005, "High-Quality Surface Splatting on Today's GPUs".
     """
-    rasterizer = BlendingRasterizer(DiscOrPixelKernel())
-    return replace(settings, rasterizer=rasterizer, lighting=LightAtPixels())
+    return replace(
+        settings, rasterizer=BlendingRasterizer(DiscOrPixelKernel()), lighting=LightAtPixels()
+    )
 
 
 def exitance(frame: Frame) -> Float[Array, "height width channels"]:

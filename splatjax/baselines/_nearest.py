@@ -32,7 +32,6 @@ class NearestRasterizer(AbstractListRasterizer):
         wins = (nearness == nearest_of_all[lists.chunk]) & (nearness > -jnp.inf)
         winner = lists.reduce_blocks(jax.ops.segment_max, jnp.where(wins, ids, -1))
         winner = winner.reshape(-1, winner.shape[2])
-        is_covered = winner >= 0
         ids = jnp.maximum(winner, 0)
         footprint = jax.tree.map(lambda plane: plane[ids], lists.footprints)
         x, y = (
@@ -42,4 +41,4 @@ class NearestRasterizer(AbstractListRasterizer):
         fragments = self.kernel.fragments(footprint, view, x - footprint.x, y - footprint.y)
         totals = jnp.stack([fragments.nearness, jnp.ones_like(x)])
         rows = jnp.concatenate([attributes[:, ids], totals])
-        return jnp.where(is_covered[None], rows, 0.0).transpose(1, 0, 2)
+        return jnp.where((winner >= 0)[None], rows, 0.0).transpose(1, 0, 2)

@@ -125,14 +125,11 @@ class PreintegratedKernel(AbstractOneKernel):
         return offsets, weights / jnp.sum(weights, axis=0)[None]
 
 
-_GAUSSIAN_PASSES = GaussianPasses()
-
-
 def diffuse_on_screen(
     frame: Frame,
     camera: Camera,
     material: Material,
-    kernel: AbstractScreenKernel = _GAUSSIAN_PASSES,
+    kernel: AbstractScreenKernel = GaussianPasses(),
 ) -> Frame:
     r"""Replace the diffused light of a picture by a blur of its irradiance in screen space.
 

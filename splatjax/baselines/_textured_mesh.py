@@ -55,8 +55,7 @@ class TexturedMesh(eqx.Module):
             )
 
         def on_device(values):
-            as_float = None if values is None else np.asarray(values, np.float64)
-            return None if as_float is None else jnp.asarray(as_float, float)
+            return None if values is None else jnp.asarray(np.asarray(values, np.float64), float)
 
         names = ("albedo", "specular", "roughness", "normal")
         maps = [on_device(getattr(textures, name, None)) for name in names]
