@@ -42,9 +42,12 @@ class AbstractProfile(eqx.Module):
 
     - `singular`: whether the profile diverges like 1/r at the origin, so that the integrals of Eq.
       3 and 4 need a cut.
+    - `has_separate_channels`: whether every array of the profile has one entry for each channel, on
+      which no other channel depends: integrals over other radii in each are then faster.
     """
 
     singular: ClassVar[bool] = False
+    has_separate_channels: ClassVar[bool] = False
 
     @abc.abstractmethod
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:

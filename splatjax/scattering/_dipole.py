@@ -31,6 +31,8 @@ class AbstractHalfSpace(AbstractProfile):
     medium: Medium
     fresnel: AbstractFresnel = ExactFresnel()
 
+    has_separate_channels: ClassVar[bool] = True
+
     def length_scale(self) -> Float[Array, " channels"]:
         """Return the mean free path, mm."""
         return 1 / self.medium.sigma_t_prime

@@ -47,6 +47,7 @@ class SingleScattering(AbstractProfile):
     strength: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0)
 
     singular: ClassVar[bool] = True
+    has_separate_channels: ClassVar[bool] = True
 
     @property
     def channels(self) -> int:
@@ -184,7 +185,7 @@ class PhotonBeam(AbstractHalfSpace):
         """
         single = SingleScattering(self.medium).total_reflectance()
         multiple = self.multiply_scattered().total_reflectance() / self.strength
-        return PhotonBeam(self.medium, self.fresnel, (total - single) / multiple)
+        return PhotonBeam(self.medium, self.fresnel, (jnp.asarray(total) - single) / multiple)
 
     @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:

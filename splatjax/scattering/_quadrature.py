@@ -166,7 +166,13 @@ def at_own_radii(
     profile: AbstractProfile, r: Float[Array, "nodes channels"]
 ) -> Float[Array, "nodes channels"]:
     """Compute each channel of a profile at its own radii (mm), in 1/mm^2."""
-    return jnp.diagonal(profile(r), axis1=1, axis2=2)
+    if not profile.has_separate_channels:
+        return jnp.diagonal(profile(r), axis1=1, axis2=2)
+
+    def channel(profile: AbstractProfile, r: Float[Array, " nodes"]):
+        return jax.tree.map(lambda leaf: leaf[None], profile)(r)[:, 0]
+
+    return jax.vmap(channel, in_axes=(0, 1), out_axes=1)(profile, r)
 
 
 @jit_unless_traced

@@ -293,6 +293,7 @@ class SkinProfile(AbstractProfile):
     shallow: Float[Array, " channels"] = eqx.field(converter=numbers)
 
     singular: ClassVar[bool] = True
+    has_separate_channels: ClassVar[bool] = True
 
     @property
     def channels(self) -> int:

@@ -136,6 +136,7 @@ class Session:
         )
         self._variances = self._planned = material.gaussians.variances
         self._angles, self._settled, self._fits = material.angles, self.start.coefficients, 0
+        self._last_fit: tuple[Hashable, SumOfGaussians] = (), material.gaussians
 
     def picture(self, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
         """Compute the picture that `splatjax.render` makes of `scene(controls)`, for a display.
@@ -231,7 +232,10 @@ class Session:
         is_own = optics is self.optics(self.start) and self._variances is gaussians.variances
         if optics is None or is_own:
             return gaussians
-        return weights_of(self.model, optics, self._variances)
+        key = controls.coefficients, self._fits
+        if self._last_fit[0] != key:
+            self._last_fit = key, weights_of(self.model, optics, self._variances)
+        return self._last_fit[1]
 
     def _gaussians(self, controls: Controls) -> SumOfGaussians:
         gaussians = self._fitted(controls)

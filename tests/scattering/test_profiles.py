@@ -60,6 +60,22 @@ RADII = np.geomspace(0.1, 4, 6)
 PLACE = tuple(map(np.asarray, ([0.0041, 0.17], [2.62, 0.88], [1.5, 1.3], 1.0, RADII)))
 
 
+@pytest.mark.parametrize("name", [*MODELS, "single scattering", "multiply scattered", "skin"])
+def test_channels_at_their_own_radii_are_those_at_all_radii(float64, name):
+    m = medium()
+    others = {
+        "single scattering": lambda m, _: sj.SingleScattering(m, [0.5, 1.0]),
+        "multiply scattered": lambda m, _: (
+            PhotonBeam(m).with_total([0.8, 0.3]).multiply_scattered()
+        ),
+        "skin": lambda *_: sj.scattering.Skin(wavelengths=[450, 650]).profile(),
+    }
+    profile = (MODELS | others)[name](m, 1.0)
+    r = np.geomspace(0.01, 5, 8).reshape(4, 2)
+    expected = np.stack([profile(r[:, channel])[:, channel] for channel in range(2)], axis=1)
+    np.testing.assert_allclose(at_own_radii(profile, r), expected, rtol=1e-9)
+
+
 @models
 def test_total_is_the_integral(float64, name):
     profile = MODELS[name](medium(), 1.0)
