@@ -18,8 +18,6 @@ from ._scene import check_alone, is_scene, scene_of_file, scene_of_options
 from ._terminal import OptionalPath, check_folder, note, stage
 from ._view import ViewOptions
 
-_DIRECTIONS = 64  # of the shadows of an environment
-
 
 @dataclass(frozen=True, kw_only=True)
 class Studio(ViewOptions):
@@ -70,18 +68,9 @@ class Studio(ViewOptions):
             skin = sj.io.load_skin(self.material)
         if observations:
             scene, camera = replace(scene, lights=observations[0].lights), observations[0].camera
-        # Environments turn with shadows that are kept.
-        directions = sj.scene.even_directions(_DIRECTIONS)
-        lights = [
-            replace(light, directions=directions)
-            if isinstance(light, sj.EnvironmentLight) and light.directions is None
-            else light
-            for light in scene.lights
-        ]
         centers, forward = np.asarray(scene.splats.centers), camera.rotation[2]
         middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
         target = camera.position + (middle - camera.position) @ forward * forward
-        scene = replace(scene, lights=tuple(lights))
         session = Session(scene, camera, target, exposure=self.exposure, skin=skin)
         place = {"host": self.host, "port": self.port}
         return Page(session, self.output, as_file, observations=observations, **place)

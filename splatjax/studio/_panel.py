@@ -70,8 +70,15 @@ class Panel:
             with gui.add_folder(f"{label}, by powers of 2", expand_by_default=False):
                 for number, name in enumerate(names):
                     add(f"{field} {number}", name, -_MOST, _MOST, 0.0)
+
+        def moved(event: Any) -> None:
+            handle = event.target
+            if hasattr(handle, "min"):  # its box takes any number
+                handle.value = min(max(handle.value, handle.min), handle.max)
+            changed()
+
         for handle in handles.values():
-            handle.on_update(lambda _: changed())
+            handle.on_update(moved)
         self._numbers = gui.add_markdown("")
 
     def add_plot(self, gui: Any) -> None:

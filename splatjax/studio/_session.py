@@ -1,8 +1,7 @@
 """A scene whose parts are kept, each until something that it depends on changes."""
 
 import dataclasses
-from collections.abc import Callable, Hashable
-from typing import Any, TypeVar
+from collections.abc import Hashable
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +24,15 @@ from splatjax.render import (
     transfer,
 )
 from splatjax.scattering import Medium, Skin
-from splatjax.scene import Camera, EnvironmentLight, Frame, Scene, Splats
+from splatjax.scene import (
+    Camera,
+    EnvironmentLight,
+    Frame,
+    Scene,
+    even_directions,
+)
 
+from ._body import Body
 from ._controls import (
     COEFFICIENTS,
     PIGMENTS,
@@ -46,30 +52,13 @@ from ._programs import (
     weights_of,
 )
 
-Kept = TypeVar("Kept")
+_DIRECTIONS = 64  # of the shadows of an environment that turns
 _MERGED = 4  # splats of the body, for which one stands while it moves
 _PLANNED = 1.2  # by which variances may differ from those of a plan
 _QUARTERS = (0.0, 90.0, 180.0, 270.0)  # degrees
 _DISTANCES = (1.0, 0.5)  # that are planned for, over that of the first camera
 # How much of diffuse and of specular light a layer shows.
 _SHARES = {"beauty": (1.0, 1.0), "diffuse": (1.0, 0.0), "specular": (0.0, 1.0)}
-
-
-class _Body:
-    """Splats, the size of their picture, and what was computed of them last, one of each kind."""
-
-    def __init__(self, splats: Splats, width: int, height: int):
-        self.splats, self.size = splats, {"width": width, "height": height}
-        self.kept: dict[str, tuple[Hashable, Any]] = {}
-
-    def has(self, kind: str, depends_on: Hashable) -> bool:
-        return self.kept.get(kind, (None,))[0] == depends_on
-
-    def keep(self, kind: str, depends_on: Hashable, make: Callable[[], Kept]) -> Kept:
-        if not self.has(kind, depends_on):
-            self.kept.pop(kind, None)  # before there are two
-            self.kept[kind] = depends_on, jax.block_until_ready(make())
-        return self.kept[kind][1]
 
 
 class Session:
@@ -83,7 +72,7 @@ class Session:
     **Arguments:**
 
     - `scene`: a material without single scattering. Where the splats have an albedo, color is that
-      alone. To turn an environment quickly, give it fixed `directions`.
+      alone. A draft shows an environment by 64 even directions unless it has its own.
     - `camera`: of the first picture.
     - `target`: at which it looks, mm.
     - `skin`: from which the material was fitted; its pigments change instead of a medium.
@@ -128,12 +117,14 @@ class Session:
         few = jax.tree.map(lambda leaf: leaf[::_MERGED], scene.splats)
         larger = {"radii": few.radii * _MERGED**0.5, "areas": few.areas * _MERGED}
         few = dataclasses.replace(few, **larger)
-        self._coarse = _Body(few, -(-camera.width // 2), -(-camera.height // 2))
-        self._full = _Body(scene.splats, camera.width, camera.height)
-        self._keeps_shadows = all(
-            isinstance(light, EnvironmentLight) and light.directions is not None
+        even = tuple(
+            dataclasses.replace(light, directions=even_directions(_DIRECTIONS))
+            if isinstance(light, EnvironmentLight) and light.directions is None
+            else light
             for light in scene.lights
         )
+        self._coarse = Body(few, even, -(-camera.width // 2), -(-camera.height // 2))
+        self._full = Body(scene.splats, tuple(scene.lights), camera.width, camera.height)
         self._variances = self._planned = material.gaussians.variances
         self._angles, self._settled, self._fits = material.angles, self.start.coefficients, 0
         self._last_fit: tuple[Hashable, SumOfGaussians] = (), material.gaussians
@@ -152,7 +143,7 @@ class Session:
         is_kept = self._full.has("basis", self._keys(controls))
         return self._show(self._full if is_kept else self._coarse, controls)
 
-    def frame(self, controls: Controls, body: _Body | None = None) -> Frame:
+    def frame(self, controls: Controls, body: Body | None = None) -> Frame:
         """Render the scene with all its layers."""
         body = body or self._full
         self._basis(body, controls)  # so that the plan suffices
@@ -185,7 +176,7 @@ class Session:
                 parts[f"per ln {COEFFICIENTS.get(name, name)}"] = controls.scale * of
         return {name: np.asarray(values, np.float64) for name, values in parts.items()}
 
-    def scene(self, controls: Controls, body: _Body | None = None, **surface: float) -> Scene:
+    def scene(self, controls: Controls, body: Body | None = None, **surface: float) -> Scene:
         """Return the scene of a state: after `picture`, that of the picture."""
         surface = {name: getattr(controls, name) for name in SURFACE} | surface
         material = dataclasses.replace(
@@ -196,10 +187,11 @@ class Session:
         )
         if isinstance(optics := self.optics(controls), Medium):
             material = dataclasses.replace(material, medium=optics)
-        lights = brightened(turned(self.own.lights, controls.turn), controls.light_stops)
-        return Scene((body or self._full).splats, lights, material)
+        body = body or self._full
+        lights = brightened(turned(body.lights, controls.turn), controls.light_stops)
+        return Scene(body.splats, lights, material)
 
-    def camera(self, controls: Controls, body: _Body | None = None) -> Camera:
+    def camera(self, controls: Controls, body: Body | None = None) -> Camera:
         """Return the camera of a state."""
         size = (body or self._full).size
         return Camera.look_at(controls.eye, controls.target, fov=self.fov, **size)
@@ -266,7 +258,7 @@ class Session:
         light = *turned, controls.eta, controls.roughness, self._fits
         return light, (controls.eye, controls.target)
 
-    def _plan(self, body: _Body, controls: Controls) -> Plan:
+    def _plan(self, body: Body, controls: Controls) -> Plan:
         """Plan for cameras and lights all around."""
 
         def make() -> Plan:
@@ -275,14 +267,14 @@ class Session:
             offsets = [d * rotation_about_y(t) @ offset for t in _QUARTERS for d in _DISTANCES]
             eyes = [_plain(np.add(start.target, offset)) for offset in offsets]
             states = [controls, *(dataclasses.replace(start, eye=eye) for eye in eyes)]
-            turns = [0.0] if self._keeps_shadows else _QUARTERS
+            turns = [0.0] if body.is_in_environments else _QUARTERS
             scenes = [dataclasses.replace(scene, lights=turned(scene.lights, t)) for t in turns]
             return make_plan(scenes, [self.camera(state, body) for state in states])
 
         return body.keep("plan", _plain(self._planned), make)
 
-    def _light(self, body: _Body, controls: Controls) -> SplatLight:
-        plan, turn = self._plan(body, controls), None if self._keeps_shadows else controls.turn
+    def _light(self, body: Body, controls: Controls) -> SplatLight:
+        plan, turn = self._plan(body, controls), None if body.keeps_shadows else controls.turn
 
         def make() -> SplatLight:
             scene = self.scene(controls, body)
@@ -291,7 +283,7 @@ class Session:
 
         return body.keep("light", self._keys(controls)[0], make)
 
-    def _basis(self, body: _Body, controls: Controls) -> DiffusionBasis:
+    def _basis(self, body: Body, controls: Controls) -> DiffusionBasis:
         def make() -> DiffusionBasis:
             scene, camera = self.scene(controls, body, specular=1.0), self.camera(controls, body)
             plan, light = self._plan(body, controls), self._light(body, controls)
@@ -303,7 +295,7 @@ class Session:
             basis = body.keep("basis", self._keys(controls), make)
         return basis
 
-    def _show(self, body: _Body, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
+    def _show(self, body: Body, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
         basis, keys = self._basis(body, controls), self._keys(controls)
         if controls.layer in _SHARES:
             diffuse, specular = _SHARES[controls.layer]
@@ -312,7 +304,8 @@ class Session:
         else:
             frame = body.keep("frame", keys, lambda: self.frame(controls, body))
             shadow = jnp.mean(frame.shadow, axis=0)[..., None]
-            values = shadow if controls.layer == "shadow" else getattr(frame, controls.layer)
+            shown = {"shadow": shadow, "irradiance": frame.irradiance / jnp.pi}
+            values = shown.get(controls.layer, frame.albedo)
         image = to_display(np.asarray(values), controls.exposure)
         return np.broadcast_to(image, (*image.shape[:2], 3))
 

@@ -185,7 +185,10 @@ def test_many_changes_compile_nothing_and_keep_nothing(studio, compiled):
 def test_layers_are_those_of_the_frame(studio, layer):
     controls = with_(studio.start, layer=layer)
     frame = studio.frame(controls)
-    layers = {"shadow": np.asarray(frame.shadow).mean(axis=0)[..., None]}
+    layers = {
+        "shadow": np.asarray(frame.shadow).mean(axis=0)[..., None],
+        "irradiance": frame.irradiance / np.pi,
+    }
     expected = sj._display.to_display(np.asarray(layers.get(layer, getattr(frame, layer, None))))
     assert np.abs(expected.astype(int) - studio.picture(controls)).max() <= SAME
 
