@@ -63,7 +63,7 @@ def deferred_splatting(settings: RenderSettings = RenderSettings()) -> RenderSet
 
 def exitance(frame: Frame) -> Float[Array, "height width channels"]:
     """Compute the radiant exitance of a picture before the exit half of the albedo, for a surface
-    without specular reflection.
+    without a change of index (`eta` 1).
 
     It is the weighted sum of the layers `L_k`; 0 where no surface is visible.
     """

@@ -61,14 +61,15 @@ class TextureSpaceSettings(eqx.Module):
     - `stretch`: `StretchCorrected()` or `Uncorrected()`.
     - `thin_parts`: `TranslucentShadowMap()` or `OpaqueParts()`.
     - `kernel`: as in pass 4; the depth of the sources affects only the far side.
-    - `shadows`: of the lights' shadow maps.
+    - `shadows`: of the lights' shadow maps; their bias is in pixels of the map, since texels have
+      no radius.
     """
 
     resolution: int = eqx.field(static=True, default=1024)
     stretch: AbstractStretch = StretchCorrected()
     thin_parts: AbstractThinParts = TranslucentShadowMap()
     kernel: _diffusion.AbstractDiffusionKernel = _diffusion.EscapeNormalization()
-    shadows: _splatting.ShadowSettings = _splatting.ShadowSettings()
+    shadows: _splatting.ShadowSettings = _splatting.ShadowSettings(bias=1.0)
 
 
 class TextureLayers(eqx.Module):
