@@ -351,7 +351,9 @@ def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp
     session = page._session
     start = session.start
     darker = tuple(1.5 * number for number in start.sigma_a)
-    target = session.frame(dataclasses.replace(start, sigma_a=darker)).beauty
+    dark = dataclasses.replace(start, sigma_a=darker)
+    session.picture(dark)  # whose variances and angles are then those of the coefficients
+    target = session.frame(dark).beauty
     camera, lights = session.camera(start), session.own.lights
     observation = sj.inverse.Observation(target, camera, lights)
     searching = Page(session, tmp_path, observations=[observation], port=18_090)
