@@ -5,7 +5,7 @@ import tomllib
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import equinox as eqx
 import numpy as np
@@ -17,6 +17,8 @@ from splatjax.studio import AsFile, Page, Session, check_viser
 from ._scene import check_alone, is_scene, scene_of_file, scene_of_options
 from ._terminal import OptionalPath, check_folder, note, stage
 from ._view import ViewOptions
+
+Opened: TypeAlias = tuple[sj.Scene, sj.Camera, sj.scattering.Skin | None, AsFile]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,11 +63,9 @@ class Studio(ViewOptions):
         check_viser()
         observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
         if self.splats is not None and is_scene(self.splats):
-            scene, camera, as_file = self._of_file(self.splats)
-            skin = sj.io.load_skin(sj.io.material_of_scene(sj.io.scene_table(self.splats)))
+            scene, camera, skin, as_file = self._of_file(self.splats)
         else:
-            scene, camera, as_file = self._of_options()
-            skin = sj.io.load_skin(self.material)
+            scene, camera, skin, as_file = self._of_options()
         if observations:
             scene, camera = replace(scene, lights=observations[0].lights), observations[0].camera
         centers, forward = np.asarray(scene.splats.centers), camera.rotation[2]
@@ -75,7 +75,7 @@ class Studio(ViewOptions):
         place = {"host": self.host, "port": self.port}
         return Page(session, self.output, as_file, observations=observations, **place)
 
-    def _of_options(self) -> tuple[sj.Scene, sj.Camera, AsFile]:
+    def _of_options(self) -> Opened:
         splats, material = self.load()
         lights = self.lights(material, self.azimuth, self.single_light[0])
         camera, images = self.camera(lambda: [splats], self.azimuth), self.environment_name or ""
@@ -86,13 +86,15 @@ class Studio(ViewOptions):
                 i if i in sj.io.ENVIRONMENTS else str(self.pictures.parent / i) for i in images
             ]
         as_file = partial(scene_of_options, self, images, sj.RenderSettings())
-        return sj.Scene(splats, lights, material), camera, as_file
+        skin = sj.io.load_skin(self.material)
+        return sj.Scene(splats, lights, material), camera, skin, as_file
 
-    def _of_file(self, path: Path) -> tuple[sj.Scene, sj.Camera, AsFile]:
+    def _of_file(self, path: Path) -> Opened:
         check_alone(self)
         with stage(f"loading {path}"):
             table = sj.io.scene_table(path)
             scene, camera, settings = sj.io.load_scene(path)
         if not eqx.tree_equal(settings, sj.RenderSettings()):
             note(f"{path}: the studio, and what it saves, are without [settings]")
-        return scene, camera, partial(scene_of_file, table, sj.RenderSettings())
+        skin = sj.io.load_skin(sj.io.material_of_scene(table))
+        return scene, camera, skin, partial(scene_of_file, table, sj.RenderSettings())
