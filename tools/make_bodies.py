@@ -53,12 +53,14 @@ class Body(NamedTuple):
 
 
 def head() -> trimesh.Trimesh:
-    """Load Lee Perry-Smith's head (CC-BY 3.0), from the folder that SPLATJAX_SHARED names."""
+    """Load Lee Perry-Smith's head (CC-BY 3.0), from the folder that SPLATJAX_SHARED names, without
+    its facets.
+    """
     path = Path("data", "lee_perry_smith", "LeePerrySmith_closed.ply")
     if "SPLATJAX_SHARED" not in os.environ:
         raise ValueError(f"SPLATJAX_SHARED is not set; the head needs the folder with {path}")
     mesh = trimesh.load(Path(os.environ["SPLATJAX_SHARED"]) / path, process=False)
-    return mesh.apply_scale(MM_PER_UNIT)
+    return mesh.apply_scale(MM_PER_UNIT).subdivide_loop(2)
 
 
 def box(depth: float) -> trimesh.Trimesh:
@@ -200,6 +202,7 @@ def models(eta: float) -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
         "escape normalization and angles": (whole, plain),
         "and single scattering": (parted, plain),
         "and a bounce": (parted, dataclasses.replace(plain, bounces=1)),
+        "and two bounces": (parted, dataclasses.replace(plain, bounces=2)),
         "the diffusion equation": (solved, dataclasses.replace(plain, diffuser=ShapeDiffuser())),
         "the same and a bounce": (
             solved,
@@ -319,7 +322,7 @@ def main() -> None:
             )
             print(rows[-1], flush=True)
         if body.name in PICTURED:
-            last = "and a bounce" if has_folds else "and single scattering"
+            last = "and two bounces" if has_folds else "and single scattering"
             columns = {"the default": "escape normalization and angles", "all terms": last}
             shown.append((truth, {title: pictures[name] for title, name in columns.items()}))
         jax.clear_caches()  # the programs of all bodies are more than one process may hold

@@ -41,7 +41,7 @@ def scene(mi, body: Body, mesh: Path, albedo=ALBEDO):
         "body": {
             "type": "ply",
             "filename": str(mesh),
-            "face_normals": body.eta == 1,
+            "face_normals": True,
             "bsdf": {"type": "null"}
             if body.eta == 1
             else {"type": "dielectric", "int_ior": body.eta, "ext_ior": 1.0},

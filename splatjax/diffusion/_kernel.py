@@ -31,6 +31,7 @@ _UNEVEN = 0.05  # from which on splats count as scattered
 _SLACK = 1e-5
 _TINY_ENERGY = 1e-12  # below which an energy does not count
 _ROUNDING = 0.01  # of the mass of a flat sheet: the corner of the gain is rounded over this excess
+_BENDS = 0.05, 10.0  # between which the rate in a sphere is not of one of two simpler forms
 _LARGEST_DECAY = 3.0  # of a layer: the tiny weights that fits give to wider ones are not physical
 _SHALLOW = 0.25  # standard deviations: the depth of sources from which curvature can be inferred
 _SAMPLE = 64  # splats whose neighbors are measured to find how evenly all are spread
@@ -162,16 +163,23 @@ class EscapeNormalization(AbstractDiffusionKernel):
     parts, which the plain mean of the paper gives the color of a flat surface.
 
     At the depth `z` below a flat surface diffused light decays as `exp(-kappa z)`. Below a surface
-    of mean curvature `H` it decays more slowly, as if the rate were `kappa - H` (at least 0), so
-    less is absorbed. In a sum of Gaussians with weights `w_k` and variances `v_k`, another rate in
-    place of `kappa`, for the same scattering, multiplies each weight by `exp(v_k (kappa^2 - rate^2)
-    / 2)`. Each layer is therefore multiplied by
+    of mean curvature `H` it decays more slowly, at the rate in a sphere of that curvature,
 
-        gain_k = exp(v_k (kappa H_k - H_k^2 / 2)),   H_k <= kappa
+        rate = kappa coth(kappa / H) - H
 
-    The rate follows from the Gaussians, `kappa^2 = (1 - W) / v`, where `W` is the fraction of the
-    light that leaves a flat surface, and `v` the mean variance of the layers, weighted by their
-    energies. (This holds for a reflectance of the form `1 / (1 + c kappa)`, with a constant `c`.)
+    so less is absorbed. In a sum of Gaussians with weights `w_k` and variances `v_k`, another rate
+    in place of `kappa`, for the same scattering, multiplies each weight by `exp(v_k (kappa^2 -
+    rate^2) / 2)`. Of the fraction `W` of the light that leaves a flat surface it makes `W / (W + (1
+    - W) rate / kappa)`, if the reflectance is of the form `1 / (1 + c kappa)`, with a constant `c`.
+    Gaussians fitted to a flat surface lack the tail that this needs, so their growth gives only the
+    shares of the layers in that of the total:
+
+        gain_k = 1 + s (exp(v_k (kappa^2 - rate_k^2) / 2) - 1)
+
+    with one `s` for all layers. To first order in the curvature it is 1.
+
+    The rate follows from the Gaussians, `kappa^2 = (1 - W) / v`, where `v` is the mean variance of
+    the layers, weighted by their energies, for the same form of the reflectance.
     The curvature follows from `S_k`, the kernel's mass on the surface divided by its mass on a flat
     sheet: `H_k = (1 - 1 / S_k) / (depth sqrt(v_k))`, which is exact on spheres that are large
     against the layer. On a sheet much thinner than the layer is wide `S_k` is 2. A layer too wide
@@ -179,8 +187,9 @@ class EscapeNormalization(AbstractDiffusionKernel):
 
     The gain is 1 on flat surfaces, where S < 1 (open edges, concave parts), and without absorption.
     For non-negative weights with a sum of at most one, no more light leaves than entered, `sum_k
-    w_k gain_k <= 1`. Negative weights of an unconstrained fit count as zero. The corner at `S = 1`
-    is rounded over 0.01.
+    w_k gain_k <= 1`; all of it leaves where the rate is 0. Negative weights of an unconstrained fit
+    count as zero. The corner at `S = 1` is rounded over 0.01. Where layers have different
+    curvatures, the rate of the total is their mean, weighted by `w_k v_k`.
 
     The source is below its splat, because the light that leaves has been inside. This makes a splat
     on the other side of a thin part nearer, and one across an air gap farther.
@@ -202,7 +211,7 @@ class EscapeNormalization(AbstractDiffusionKernel):
         variance = variances.reshape(*variances.shape, *[1] * lacking)
         mean_variance = jnp.sum(energies * variance, axis=0) / jnp.maximum(leaves, _TINY_ENERGY)
         squared_rate = absorbed / jnp.where(mean_variance > 0, mean_variance, 1.0)
-        squared = jnp.minimum(squared_rate[None] * variance, _LARGEST_DECAY**2)
+        squared = squared_rate[None] * variance
         decay = jnp.sqrt(jnp.maximum(squared, _TINY_ENERGY))
 
         # The curvature in the same unit, by the greatest mass of all layers not wider. Not by
@@ -216,13 +225,30 @@ class EscapeNormalization(AbstractDiffusionKernel):
         excess = excess * excess / (excess + _ROUNDING)
         curvature = excess / (1 + excess) / max(self.depth, _SHALLOW)
 
-        exponent = jnp.where(
-            curvature < decay, curvature * (decay - 0.5 * curvature), 0.5 * squared
-        )
-        grown = jnp.expm1(exponent)
-        # All layers together gain at most what a flat surface absorbs.
-        added = jnp.sum(energies * grown, axis=0) / jnp.maximum(absorbed, _TINY_ENERGY)
-        return 1 + grown * ((1 + added**4) ** -0.25)[None]
+        # The growth of each layer at the rate in a sphere of its curvature, and that of the total at
+        # the mean rate.
+        slowed = _slowed(curvature / decay)
+        squared = jnp.minimum(squared, _LARGEST_DECAY**2)
+        grown = jnp.expm1(0.5 * squared * slowed * (2 - slowed))
+        spread = energies * squared
+        mean = _ratio(jnp.sum(spread * slowed, axis=0), jnp.sum(spread, axis=0))
+        total = leaves * absorbed * mean / jnp.maximum(1 - absorbed * mean, _TINY_ENERGY)
+        return 1 + grown * _ratio(total, jnp.sum(energies * grown, axis=0))[None]
+
+
+def _ratio(part: Float[Array, "..."], whole: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Divide; 1 where the whole does not count."""
+    counts = jnp.abs(whole) > _TINY_ENERGY
+    return jnp.where(counts, part / jnp.where(counts, whole, 1.0), 1.0)
+
+
+def _slowed(bend: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Compute the fraction `1 - coth(1 / bend) + bend` by which light decays more slowly in a
+    sphere than below a plane; `bend` is the curvature over the rate.
+    """
+    slight = bend - 2 / jnp.expm1(2 / jnp.clip(bend, *_BENDS))
+    inverse = 1 / jnp.maximum(bend, _BENDS[0])
+    return jnp.where(bend < _BENDS[1], slight, 1 - inverse / 3 + inverse**3 / 45)
 
 
 def resolved_fraction(

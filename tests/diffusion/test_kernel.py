@@ -40,11 +40,11 @@ WEIGHTS = np.asarray(
     ]
 )
 # What a sheet of so many mm lets through of light from straight above, that which never met it left
-# out: 400,000 walks.
+# out: 400,000 walks. And by how much the Gaussians may be off.
 THROUGH = {
-    2.0: [0.2198, 0.3138, 0.3433],
-    4.0: [0.1096, 0.2290, 0.2828],
-    8.0: [0.0156, 0.0880, 0.1627],
+    2.0: ([0.2198, 0.3138, 0.3433], 0.12),
+    4.0: ([0.1096, 0.2290, 0.2828], 0.16),
+    8.0: ([0.0156, 0.0880, 0.1627], 0.25),
 }
 
 
@@ -190,7 +190,26 @@ def test_spheres_return_what_walks_do(radius):
     mass = np.asarray([at_pole(*layer).values[-1, 0] for layer in layers])
     mass = np.where(variances > 0.5 * float(body.areas[0]), mass, 1.0)
     gained = returned(mass, weights, variances) / weights.sum(0)
-    np.testing.assert_allclose(gained, SPHERES[radius], rtol=0.08 if radius < 15 else 0.045)
+    np.testing.assert_allclose(gained, SPHERES[radius], rtol=0.065 if radius < 15 else 0.04)
+
+
+@pytest.mark.parametrize("absorbed", [1e-4, 0.4])
+def test_light_decays_in_a_sphere_as_the_diffusion_equation_has_it(absorbed, float64):
+    """Of what a flat surface absorbs, a sphere returns as much whatever the Gaussians are, if they
+    have the same total and decay rate.
+    """
+    leaves = 1 - absorbed
+    for variances, shares in (([2.0], [1.0]), ([0.5, 2.0, 5.0], [0.3, 0.5, 0.2])):
+        deviations, weights = np.sqrt(variances), leaves * np.asarray(shares)[:, None]
+        rate = np.sqrt(absorbed / np.dot(shares, variances))
+        for radius in np.geomspace(2.0, 1e4, 40):
+            excess = 1 / (1 - KERNEL.depth * deviations / radius) - 1
+            # The mass whose excess, rounded where it begins, is this one.
+            mass = 1 + 0.5 * (excess + np.sqrt(excess * (excess + 0.04)))
+            slower = (rate / np.tanh(rate * radius) - 1 / radius) / rate
+            saved = (returned(mass, weights, variances)[0] - leaves) / absorbed
+            truth = (leaves / (leaves + absorbed * slower) - leaves) / absorbed
+            np.testing.assert_allclose(saved, truth, rtol=2e-5, atol=1e-6)
 
 
 @pytest.mark.once
@@ -245,7 +264,8 @@ def test_sheets_let_through_what_walks_say(thickness):
     """Far better than the mean over the splats, which loses from a third to three quarters of
     it.
     """
-    truth, spacing = np.asarray(THROUGH[thickness]), 0.6
+    (truth, bound), spacing = THROUGH[thickness], 0.6
+    truth = np.asarray(truth)
     off = []
     for kernel in (KERNEL, PlainMean()):
         given = thickness, 30.0, spacing, (0.0, 1.0), jnp.asarray(VARIANCES, float), kernel
@@ -255,8 +275,8 @@ def test_sheets_let_through_what_walks_say(thickness):
         means, mass = np.where(resolved, means, 0.0), np.where(resolved, mass, 1.0)
         layers = means[:, None] * np.asarray(gains(mass, WEIGHTS, VARIANCES, 0.0, kernel))
         off.append(np.abs(np.sum(WEIGHTS * layers, axis=0) / truth - 1)[truth > 0.05])
-    assert np.all(off[0] < 0.25), off
-    assert np.all(off[0] < 0.35 * off[1]), off
+    assert np.all(off[0] < bound), off
+    assert np.all(off[0] < 0.36 * off[1]), off
 
 
 @pytest.mark.once
