@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 from bodies import assert_close
 
-from splatjax._chunking import (
-    list_chosen,
-    map_chunks,
-    needed_over_planned,
-    running,
-    zeros_after,
-)
+from splatjax._chunking import map_chunks, needed_over_planned, zeros_after
 
 
 def squares_and_lengths(scale, record):
@@ -49,19 +43,6 @@ def test_parts_give_what_the_whole_gives(at_once):
     np.testing.assert_allclose(along(parts), along(whole), **close)
 
 
-def test_a_part_that_is_filled_up_adds_nothing():
-    """What fills the last part is a copy of the last point: no zero of which a norm has no
-    derivative.
-    """
-    points = jnp.ones((5, 3))
-    slope = jax.jit(
-        jax.grad(
-            lambda p: jnp.sum(map_chunks(lambda part: jnp.linalg.norm(part, axis=1), p, at_once=3))
-        )
-    )(points)
-    np.testing.assert_allclose(np.asarray(slope), 1 / np.sqrt(3), rtol=1e-6)
-
-
 def test_zeros_wait_for_what_must_be_known_and_are_zeros_whatever_it_is():
     make = jax.jit(lambda known: zeros_after(known, (2, 3), jnp.float32))
     for known in (-1.0, 0.0, 5.0, np.nan, np.inf):
@@ -77,22 +58,3 @@ def test_one_more_than_planned_is_reported_however_much_was_planned(planned):
     assert float(ratio(jnp.int32(planned))) == 1
     assert float(ratio(jnp.int32(planned + 1))) > 1
     assert float(ratio(jnp.int32(0))) == 0
-
-
-@pytest.mark.parametrize("count", [1, 2, 7, 1024, 1000])
-def test_running_sums_and_maxima_are_numpys(count):
-    numbers = np.random.default_rng(count).integers(0, 9, (3, count)).astype(np.int32)
-    for combine, expected in (
-        (jnp.add, np.cumsum(numbers, axis=1)),
-        (jnp.maximum, np.maximum.accumulate(numbers, axis=1)),
-    ):
-        np.testing.assert_array_equal(running(combine, jnp.asarray(numbers)), expected)
-
-
-@pytest.mark.parametrize("capacity", [1, 40, 100])
-def test_the_chosen_are_listed_in_order_up_to_the_capacity(capacity):
-    chosen = np.random.default_rng(2).random(100) < 0.4
-    expected = np.full(capacity, 100)
-    indices = np.flatnonzero(chosen)[:capacity]
-    expected[: len(indices)] = indices
-    np.testing.assert_array_equal(list_chosen(jnp.asarray(chosen), capacity), expected)

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
-import equinox as eqx
 import numpy as np
 import tyro
 
@@ -15,10 +14,10 @@ import splatjax as sj
 from splatjax.studio import AsFile, Page, Session, check_viser
 
 from ._scene import check_alone, is_scene, scene_of_file, scene_of_options
-from ._terminal import OptionalPath, check_folder, note, stage
+from ._terminal import OptionalPath, check_folder, stage
 from ._view import ViewOptions
 
-Opened: TypeAlias = tuple[sj.Scene, sj.Camera, sj.scattering.Skin | None, AsFile]
+Opened: TypeAlias = tuple[sj.Scene, sj.Camera, sj.RenderSettings, sj.scattering.Skin | None, AsFile]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,15 +62,15 @@ class Studio(ViewOptions):
         check_viser()
         observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
         if self.splats is not None and is_scene(self.splats):
-            scene, camera, skin, as_file = self._of_file(self.splats)
+            scene, camera, settings, skin, as_file = self._of_file(self.splats)
         else:
-            scene, camera, skin, as_file = self._of_options()
+            scene, camera, settings, skin, as_file = self._of_options()
         if observations:
             scene, camera = replace(scene, lights=observations[0].lights), observations[0].camera
         centers, forward = np.asarray(scene.splats.centers), camera.rotation[2]
         middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
         target = camera.position + (middle - camera.position) @ forward * forward
-        session = Session(scene, camera, target, exposure=self.exposure, skin=skin)
+        session = Session(scene, camera, target, settings, exposure=self.exposure, skin=skin)
         place = {"host": self.host, "port": self.port}
         return Page(session, self.output, as_file, observations=observations, **place)
 
@@ -85,16 +84,14 @@ class Studio(ViewOptions):
             images = [
                 i if i in sj.io.ENVIRONMENTS else str(self.pictures.parent / i) for i in images
             ]
-        as_file = partial(scene_of_options, self, images, sj.RenderSettings())
+        as_file = partial(scene_of_options, self, images, self.settings)
         skin = sj.io.load_skin(self.material)
-        return sj.Scene(splats, lights, material), camera, skin, as_file
+        return sj.Scene(splats, lights, material), camera, self.settings, skin, as_file
 
     def _of_file(self, path: Path) -> Opened:
         check_alone(self)
         with stage(f"loading {path}"):
             table = sj.io.scene_table(path)
             scene, camera, settings = sj.io.load_scene(path)
-        if not eqx.tree_equal(settings, sj.RenderSettings()):
-            note(f"{path}: the studio, and what it saves, are without [settings]")
         skin = sj.io.load_skin(sj.io.material_of_scene(table))
-        return scene, camera, skin, partial(scene_of_file, table, sj.RenderSettings())
+        return scene, camera, settings, skin, partial(scene_of_file, table, settings)

@@ -66,6 +66,12 @@ class ViewOptions:
     exposure: float = 0.0
     #: Let light spread below the surface. Without scattering it leaves where it enters.
     scattering: bool = True
+    #: Model of the light below the surface: the profile of a flat surface (clusters); the same in
+    #: less time, with the sum of the layers alone in the EXR (exitance); or the diffusion equation
+    #: in the closed body, from the coefficients of the material (shape).
+    diffusion: Literal["clusters", "exitance", "shape"] = "clusters"
+    #: Number of times that light may leave the body and enter it again: 1 or 2 brighten folds.
+    bounces: int = 0
     #: Use the maps of the splats (of the bust: skin). Without them the material alone is seen.
     albedo: bool = True
     #: Number of splats of the built-in bust.
@@ -106,6 +112,12 @@ class ViewOptions:
                 -90 < self.elevation < 90,
                 "lie between -90 and 90 degrees, both excluded",
             ),
+            "bounces": (self.bounces >= 0, "be 0 or more"),
+            "diffusion": (
+                self.diffusion != "shape"
+                or (self.scattering and sj.load_material(self.material).medium is not None),
+                f"be clusters without scattering, or if {self.material} has no [medium]",
+            ),
         }
         check_options(self, rules | (more_rules or {}))
         check_displayable(sj.load_material(self.material).channels)
@@ -145,6 +157,10 @@ class ViewOptions:
             )
         return sj.io.load_environment(name) if name else None
 
+    @property
+    def settings(self) -> sj.RenderSettings:
+        return sj.RenderSettings(bounces=self.bounces, diffuser=sj.io.DIFFUSERS[self.diffusion])
+
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
         with stage(
@@ -155,6 +171,11 @@ class ViewOptions:
         return splats, self.material_for(splats)
 
     def material_for(self, splats: sj.Splats) -> sj.Material:
+        if self.diffusion == "shape" and splats.albedo is not None:
+            raise ValueError(
+                "--diffusion shape computes color from the coefficients of the material, and the "
+                "splats carry albedo; give --no-albedo"
+            )
         material = sj.load_material(self.material)
         if splats.albedo is not None:
             material = material.white()
@@ -220,14 +241,8 @@ class ViewOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions(ViewOptions):
-    """The model of light below the surface, and what the files of a picture contain."""
+    """What the files of a picture contain."""
 
-    #: Model of the light below the surface: the profile of a flat surface (clusters); the same in
-    #: less time, with the sum of the layers alone in the EXR (exitance); or the diffusion equation
-    #: in the closed body, from the coefficients of the material (shape).
-    diffusion: Literal["clusters", "exitance", "shape"] = "clusters"
-    #: Number of times that light may leave the body and enter it again: 1 or 2 brighten folds.
-    bounces: int = 0
     #: Background of the PNG: black, transparent, or the environment. The EXR has coverage and no
     #: background.
     background: Literal["black", "transparent", "environment"] = "black"
@@ -240,26 +255,8 @@ class PictureOptions(ViewOptions):
                 self.background != "environment" or self.environment_name is not None,
                 "be black or transparent with single lights and no --environment",
             ),
-            "bounces": (self.bounces >= 0, "be 0 or more"),
-            "diffusion": (
-                self.diffusion != "shape"
-                or (self.scattering and sj.load_material(self.material).medium is not None),
-                f"be clusters without scattering, or if {self.material} has no [medium]",
-            ),
         }
         super().check(rules | (more_rules or {}))
-
-    @property
-    def settings(self) -> sj.RenderSettings:
-        return sj.RenderSettings(bounces=self.bounces, diffuser=sj.io.DIFFUSERS[self.diffusion])
-
-    def material_for(self, splats: sj.Splats) -> sj.Material:
-        if self.diffusion == "shape" and splats.albedo is not None:
-            raise ValueError(
-                "--diffusion shape computes color from the coefficients of the material, and the "
-                "splats carry albedo; give --no-albedo"
-            )
-        return super().material_for(splats)
 
     def write(
         self,

@@ -225,8 +225,8 @@ class EscapeNormalization(AbstractDiffusionKernel):
         excess = excess * excess / (excess + _ROUNDING)
         curvature = excess / (1 + excess) / max(self.depth, _SHALLOW)
 
-        # The growth of each layer at the rate in a sphere of its curvature, and that of the total at
-        # the mean rate.
+        # The growth of each layer at the rate in a sphere of its curvature, and of the total at the
+        # mean rate.
         slowed = _slowed(curvature / decay)
         squared = jnp.minimum(squared, _LARGEST_DECAY**2)
         grown = jnp.expm1(0.5 * squared * slowed * (2 - slowed))

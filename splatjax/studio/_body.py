@@ -3,20 +3,36 @@
 from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
 
-from splatjax.scene import AbstractLight, EnvironmentLight, Splats
+from splatjax.render import DiffusionBasis, RenderSettings
+from splatjax.scene import AbstractLight, EnvironmentLight, Frame, Splats
 
 Kept = TypeVar("Kept")
+Rendered = TypeVar("Rendered", DiffusionBasis, Frame)
 
 
 class Body:
     """Splats, lights, the size of their picture, and what was computed of them last, one of each
     kind.
+
+    **Arguments:**
+
+    - `settings`: with any but the usual ones, no layers are kept that any weights can blend.
     """
 
-    def __init__(self, splats: Splats, lights: tuple[AbstractLight, ...], width: int, height: int):
+    def __init__(
+        self,
+        splats: Splats,
+        lights: tuple[AbstractLight, ...],
+        width: int,
+        height: int,
+        settings: RenderSettings = RenderSettings(),
+    ):
         self.splats, self.lights, self.size = splats, lights, {"width": width, "height": height}
+        self.settings = settings
+        self.is_blended = eqx.tree_equal(settings, RenderSettings())
         self.kept: dict[str, tuple[Hashable, Any]] = {}
         environments = [light for light in lights if isinstance(light, EnvironmentLight)]
         self.is_in_environments = len(environments) == len(lights)
@@ -33,3 +49,11 @@ class Body:
             self.kept.pop(kind, None)  # before there are two
             self.kept[kind] = depends_on, jax.block_until_ready(make())
         return self.kept[kind][1]
+
+    def planned(self, make: Callable[[], Rendered]) -> Rendered:
+        """Return what is rendered, with a new plan if the one that is kept does not suffice."""
+        rendered = make()
+        if rendered.overflow > 0:
+            self.kept.clear()
+            rendered = make()
+        return rendered

@@ -64,10 +64,11 @@ def save(
     if kind == "PNG":
         write_png(paths[0], session.frame(controls), exposure=controls.exposure)
     elif kind == "EXR":
+        frame, variances = session.frame(controls), scene.material.gaussians.variances
         write_exr(
             paths[0],
-            session.frame(controls),
-            variances=scene.material.gaussians.variances.tolist(),
+            frame,
+            variances=variances.tolist() if len(frame.weights) == len(variances) else None,
             manifest={"scene": record} if record else None,
             camera=camera,
         )
@@ -78,7 +79,7 @@ def save(
         if record:
             write_toml(paths[0], record)
         else:
-            save_scene(paths[0], scene, camera)
+            save_scene(paths[0], scene, camera, session.settings)
         with atomic_path(paths[1]) as temporary:
             program = _PROGRAM.format(name=name, exposure=controls.exposure)
             temporary.write_text(program, encoding="utf-8")

@@ -16,6 +16,7 @@ from splatjax.io import spectrum_to_rgb
 from splatjax.render import (
     DiffusionBasis,
     Plan,
+    RenderSettings,
     SplatLight,
     diffusion_basis,
     illuminate,
@@ -67,7 +68,8 @@ class Session:
     Of each kind one result is kept: the visibility of the lights, the light on the splats, and the
     layers of the view (`splatjax.DiffusionBasis`). While coefficients move, the variances of the
     Gaussians are held, their weights are fitted, and the kept layers are blended. Where nothing is
-    kept for a state, `draft` shows a quarter of the splats in half the width and height.
+    kept for a state, `draft` shows a quarter of the splats in half the width and height. Drafts
+    have the usual settings.
 
     **Arguments:**
 
@@ -75,6 +77,7 @@ class Session:
       alone. A draft shows an environment by 64 even directions unless it has its own.
     - `camera`: of the first picture.
     - `target`: at which it looks, mm.
+    - `settings`: of the pictures, such as bounces.
     - `skin`: from which the material was fitted; its pigments change instead of a medium.
 
     **Attributes:**
@@ -89,6 +92,7 @@ class Session:
         scene: Scene,
         camera: Camera,
         target: Numbers,
+        settings: RenderSettings = RenderSettings(),
         *,
         exposure: float = 0.0,
         skin: Skin | None = None,
@@ -109,7 +113,7 @@ class Session:
             light_stops=(0.0,) * len(scene.lights),
             exposure=exposure,
         )
-        self.own, self.skin = scene, skin
+        self.own, self.skin, self.settings = scene, skin, settings
         self.model: _fitting.AbstractModel = _fitting.TransportModel()
         if skin is not None:
             self.model = _fitting.SkinModel(spectrum_to_rgb(skin.wavelengths))
@@ -124,7 +128,9 @@ class Session:
             for light in scene.lights
         )
         self._coarse = Body(few, even, -(-camera.width // 2), -(-camera.height // 2))
-        self._full = Body(scene.splats, tuple(scene.lights), camera.width, camera.height)
+        full = scene.splats, tuple(scene.lights), camera.width, camera.height
+        self._still = Body(*full, settings)
+        self._full = self._still if self._still.is_blended else Body(*full)
         self._variances = self._planned = material.gaussians.variances
         self._angles, self._settled, self._fits = material.angles, self.start.coefficients, 0
         self._last_fit: tuple[Hashable, SumOfGaussians] = (), material.gaussians
@@ -134,22 +140,26 @@ class Session:
         Before, variances and angles follow the coefficients.
         """
         self._settle(controls)
-        return self._show(self._full, controls)
+        self._basis(self._full, controls)  # for drafts
+        return self._show(self._still, controls)
 
     def draft(self, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
         """Compute a picture at once: of the layers that are kept, with the variances and angles of
         the last `picture`; or a coarse one.
         """
-        is_kept = self._full.has("basis", self._keys(controls))
+        is_kept = self._full.has("basis", self._keys(controls, self._full))
         return self._show(self._full if is_kept else self._coarse, controls)
 
     def frame(self, controls: Controls, body: Body | None = None) -> Frame:
         """Render the scene with all its layers."""
-        body = body or self._full
-        self._basis(body, controls)  # so that the plan suffices
-        scene, camera = self.scene(controls, body), self.camera(controls, body)
-        plan, light = self._plan(body, controls), self._light(body, controls)
-        return render(scene, camera, plan=plan, light=light)
+        body = body or self._still
+
+        def make() -> Frame:
+            scene, camera = self.scene(controls, body), self.camera(controls, body)
+            plan, light = self._plan(body, controls), self._light(body, controls)
+            return render(scene, camera, body.settings, plan, light=light)
+
+        return body.planned(make)
 
     def pixel(
         self, controls: Controls, column: int, row: int
@@ -252,11 +262,13 @@ class Session:
         if np.max(np.abs(np.log(self._variances / self._planned))) > np.log(_PLANNED):
             self._planned = self._variances
 
-    def _keys(self, controls: Controls) -> tuple[Hashable, Hashable]:
+    def _keys(self, controls: Controls, body: Body) -> tuple[Hashable, Hashable]:
         """Return what the light on the splats depends on, and what the view does besides."""
-        turned = controls.turn, controls.light_stops
-        light = *turned, controls.eta, controls.roughness, self._fits
-        return light, (controls.eye, controls.target)
+        state: Hashable = dataclasses.replace(controls, eye=(), target=(), layer="", exposure=0.0)
+        if body.is_blended:
+            turned = controls.turn, controls.light_stops
+            state = *turned, controls.eta, controls.roughness
+        return (state, self._fits), (controls.eye, controls.target)
 
     def _plan(self, body: Body, controls: Controls) -> Plan:
         """Plan for cameras and lights all around."""
@@ -269,7 +281,8 @@ class Session:
             states = [controls, *(dataclasses.replace(start, eye=eye) for eye in eyes)]
             turns = [0.0] if body.is_in_environments else _QUARTERS
             scenes = [dataclasses.replace(scene, lights=turned(scene.lights, t)) for t in turns]
-            return make_plan(scenes, [self.camera(state, body) for state in states])
+            cameras = [self.camera(state, body) for state in states]
+            return make_plan(scenes, cameras, body.settings)
 
         return body.keep("plan", _plain(self._planned), make)
 
@@ -278,10 +291,11 @@ class Session:
 
         def make() -> SplatLight:
             scene = self.scene(controls, body)
-            visible = body.keep("visibility", (turn,), lambda: transfer(scene, plan))
-            return illuminate(scene, plan, light=visible)
+            given = scene, plan, body.settings
+            visible = body.keep("visibility", (turn,), lambda: transfer(*given))
+            return illuminate(*given, light=visible)
 
-        return body.keep("light", self._keys(controls)[0], make)
+        return body.keep("light", self._keys(controls, body)[0], make)
 
     def _basis(self, body: Body, controls: Controls) -> DiffusionBasis:
         def make() -> DiffusionBasis:
@@ -289,23 +303,19 @@ class Session:
             plan, light = self._plan(body, controls), self._light(body, controls)
             return diffusion_basis(scene, camera, plan=plan, light=light)
 
-        basis = body.keep("basis", self._keys(controls), make)
-        if basis.overflow > 0:
-            body.kept.clear()  # to plan for this state too
-            basis = body.keep("basis", self._keys(controls), make)
-        return basis
+        return body.keep("basis", self._keys(controls, body), lambda: body.planned(make))
 
     def _show(self, body: Body, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
-        basis, keys = self._basis(body, controls), self._keys(controls)
-        if controls.layer in _SHARES:
-            diffuse, specular = _SHARES[controls.layer]
+        if body.is_blended and controls.layer in _SHARES:
+            basis, (diffuse, specular) = self._basis(body, controls), _SHARES[controls.layer]
             shares = jnp.asarray([diffuse, specular * controls.specular], basis.specular.dtype)
             values = blend(basis, self._gaussians(controls), shares)
         else:
+            keys = self._keys(controls, body)
             frame = body.keep("frame", keys, lambda: self.frame(controls, body))
             shadow = jnp.mean(frame.shadow, axis=0)[..., None]
             shown = {"shadow": shadow, "irradiance": frame.irradiance / jnp.pi}
-            values = shown.get(controls.layer, frame.albedo)
+            values = shown.get(controls.layer, getattr(frame, controls.layer))
         image = to_display(np.asarray(values), controls.exposure)
         return np.broadcast_to(image, (*image.shape[:2], 3))
 

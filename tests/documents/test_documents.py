@@ -322,7 +322,3 @@ def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
     for what, value in names.items():
         for leaf in jax.tree.leaves(eqx.filter(value, eqx.is_inexact_array)):
             assert not np.any(np.isnan(leaf)), what
-
-
-def test_every_context_is_of_a_page_with_programs():
-    assert {param.id for param in WITH_PROGRAMS} >= WITH_CONTEXT

@@ -39,7 +39,6 @@ LONG = {
     ("sun and beam", "plain"),
     ("ball over sheet", "plain"),
     ("solved body", "solved"),
-    ("harmonic light", "plain"),
     ("extended lights", "plain"),
 }  # what they add to the others, long tests show
 RECORDS = [

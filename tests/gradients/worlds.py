@@ -129,16 +129,10 @@ def extended_lights() -> World:
         sj.scene.DiskLight([12, -9, 30], [6, 8], [-0.3, 0.3, -1], 4.0, count=2),
         sj.scene.SphereLight([16, 14, 22], [9, 4], 3.0, count=2),
         sj.EnvironmentLight(image, -20.0, 0.4, directions=[[1, 2, 2], [-2, 1, 1], [0, -1, 3]]),
+        sj.scene.HarmonicLight([[3.0, 2.0], [0.3, -0.2], [0.5, 0.4], [-0.2, 0.6]], count=4),
     )
     body = uneven(_colored(bodies.bumpy(160)))
     return World(sj.Scene(body, lights, sj.Material(_gaussians(), roughness=0.4)), view())
-
-
-def harmonic_light() -> World:
-    coefficients = [[3.0, 2.0], [0.3, -0.2], [0.5, 0.4], [-0.2, 0.6]]
-    light = sj.scene.HarmonicLight(coefficients, count=4)
-    body = uneven(_colored(bodies.bumpy(160)))
-    return World(sj.Scene(body, (light,), sj.Material(_gaussians(), roughness=0.4)), view())
 
 
 # The plain path is checked everywhere; the fast one where all its parts take part, and against the
@@ -151,7 +145,6 @@ WORLDS = {
     "scattered once": Small(scattered_once),
     "solved body": Small(solved_body, {"solved": SOLVED}),
     "extended lights": Small(extended_lights),
-    "harmonic light": Small(harmonic_light),
 }
 
 

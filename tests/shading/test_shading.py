@@ -107,14 +107,6 @@ def test_degenerate_places_are_finite(place, roughness, dtype):
         assert all(np.all(np.asarray(slope) == 0) for slope in slopes)
 
 
-def test_gradients_of_the_lobe(float64):
-    wi, wo = jnp.asarray(random_directions(8, 6)), jnp.asarray(random_directions(8, 7))
-    normal = jnp.asarray(unit(random_directions(8, 8) + np.asarray([0, 0, 3.0])))
-    scalars = (jnp.asarray(0.05), jnp.asarray(0.5), jnp.asarray(0.4))
-    given = normal, wi, wo, *scalars
-    check_grads(jax.jit(lobe_at), given, order=2, modes=["rev"], rtol=1e-5)
-
-
 @pytest.mark.once
 def test_root_of_albedo_and_its_floor(dtype):
     albedo = jnp.asarray([0.0, 1e-5, 1e-4, 0.25, 1.0], dtype)
@@ -247,19 +239,6 @@ def test_slopes_agree_with_the_quadrature(float64):
         )
 
 
-@pytest.mark.parametrize(
-    ("function", "arguments", "order"),
-    [
-        (leaving, ([0.07, 0.4, 0.9], 0.05, [0.2, 0.5, 0.8], [[0.8], [0.3], [-0.1]]), 1),
-        (lambda mu: directional_albedo(mu, *arrays(None, 0.05, 0.3)), (0.4,), 2),
-    ],
-    ids=["leaving", "twice in the cosine"],
-)
-def test_gradients_in_every_argument(float64, function, arguments, order):
-    given = arrays(None, *arguments)
-    check_grads(jax.jit(function), given, order, modes=["rev"], rtol=1e-5, eps=1e-6)
-
-
 VALUES_AND_SLOPES = [
     jax.jit(jax.value_and_grad(each, argnums=(0, 1, 2))) for each in (directional_albedo, leaving)
 ]
@@ -325,17 +304,6 @@ def test_irradiance_is_the_sum_of_the_formulas(count, float32):
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 
 
-def test_a_spot_has_its_derivatives(float64):
-    points = jnp.asarray(PLACE * [[0.3], [0.5]] + [[1, 0, 3], [-2, 1, 0]])
-
-    @jax.jit
-    def received(place, direction, inner, outer, points):
-        return sj.scene.SpotLight(place, direction, STRENGTHS[2], inner, outer).incidence(points)
-
-    given = jnp.asarray(PLACE), -jnp.asarray(PLACE), 3.0, 40.0, points
-    check_grads(received, given, order=2, modes=["rev"])
-
-
 EDGES = np.asarray([[3.0, 0, 0], [0, 2.0, 0]])
 EVEN = (np.arange(300) + 0.5) / 300
 SQUARES = np.stack(np.meshgrid(EVEN - 0.5, EVEN - 0.5), -1).reshape(-1, 2) @ EDGES
@@ -361,10 +329,45 @@ def test_the_solid_angle_is_the_sum_over_its_area(kind, dtype):
     np.testing.assert_allclose(ball, 2 * np.pi * (1 - cone), rtol=1e-4)
 
 
-def test_solid_angles_have_derivatives(float64):
-    lights = LIGHTS["rectangle"][0], LIGHTS["disk"][0], sj.scene.SphereLight([0] * 3, 1, 1.0)
-    angles = jax.jit(lambda x: [light.solid_angle(x) for light in lights])
-    check_grads(angles, (jnp.asarray(SEEN_FROM[2:]),), order=1, modes=["rev"], rtol=1e-5)
+FACING = unit(random_directions(8, 8) + np.asarray([0, 0, 3.0]))
+SHAPES = [*(light for light, *_ in LIGHTS.values()), sj.scene.SphereLight([0] * 3, 1, 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "how"),
+    [
+        (
+            lobe_at,
+            (FACING, random_directions(8, 6), random_directions(8, 7), 0.05, 0.5, 0.4),
+            {"order": 2, "rtol": 1e-5},
+        ),
+        (
+            leaving,
+            ([0.07, 0.4, 0.9], 0.05, [0.2, 0.5, 0.8], [[0.8], [0.3], [-0.1]]),
+            {"order": 1, "rtol": 1e-5, "eps": 1e-6},
+        ),
+        (
+            lambda mu: directional_albedo(mu, *arrays(None, 0.05, 0.3)),
+            (0.4,),
+            {"order": 2, "rtol": 1e-5, "eps": 1e-6},
+        ),
+        (
+            lambda place, way, inner, outer, points: sj.scene.SpotLight(
+                place, way, STRENGTHS[2], inner, outer
+            ).incidence(points),
+            (PLACE, -PLACE, 3.0, 40.0, PLACE * [[0.3], [0.5]] + [[1, 0, 3], [-2, 1, 0]]),
+            {"order": 2},
+        ),
+        (
+            lambda x: [light.solid_angle(x) for light in SHAPES],
+            (SEEN_FROM[2:],),
+            {"order": 1, "rtol": 1e-5},
+        ),
+    ],
+    ids=["lobe", "leaving", "twice in the cosine", "spot", "solid angles"],
+)
+def test_gradients_in_every_argument(float64, function, arguments, how):
+    check_grads(jax.jit(function), arrays(None, *arguments), modes=["rev"], **how)
 
 
 @pytest.mark.once

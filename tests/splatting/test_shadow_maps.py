@@ -127,7 +127,6 @@ def test_each_surface_blocks_what_reaches_it():
         middle = np.floor(place) + np.arange(-1, 2)[:, None]
         away = np.abs(middle + 0.5 - place)
         weights = np.where(away < 0.5, 0.75 - away**2, 0.5 * np.clip(1.5 - away, 0, None) ** 2)
-        np.testing.assert_allclose(weights.sum(axis=0), 1)
         return (weights * ((middle >= 0) & (middle < size))).sum(axis=0)
 
     expected = 1 - blocked * share_inside(column) * share_inside(row)

@@ -20,6 +20,7 @@ from PIL import Image
 
 import splatjax as sj
 from splatjax.cli._studio import Studio
+from splatjax.diffusion import ShapeDiffuser
 from splatjax.studio import Page, Search, Session, save, turned
 
 pytestmark = pytest.mark.once
@@ -67,6 +68,21 @@ def test_a_picture_is_that_of_render(studio, states, name):
     frame = sj.render(studio.scene(controls), studio.camera(controls))
     assert np.abs(shown(frame, controls) - picture).max() <= SAME
     assert draft.mean() == pytest.approx(picture.mean(), rel=COARSE)
+
+
+def test_the_whole_picture_has_the_settings(studio, states):
+    controls, settings = states["absorption"], sj.RenderSettings(diffuser=ShapeDiffuser())
+    view = studio.camera(studio.start), studio.start.target
+    session = Session(studio.own, *view, settings)
+    for state in (studio.start, controls):
+        session.draft(state)
+        picture = session.picture(state).astype(int)
+        frame = sj.render(session.scene(state), session.camera(state), settings)
+        assert np.abs(shown(frame, state) - picture).max() <= SAME
+    draft = session.draft(controls).astype(int)
+    assert np.abs(picture - draft).max() > 20
+    usual = sj.render(session.scene(controls), session.camera(controls))
+    assert np.abs(shown(usual, controls) - draft).max() <= SAME
 
 
 def test_coefficients_are_fitted_as_a_material_is(studio, states):
@@ -239,7 +255,7 @@ bounces = 1
 
 
 @pytest.mark.filterwarnings("default")  # of viser and of the libraries that it stands on
-def test_a_scene_file_opens_and_what_is_saved_is_one(tmp_path, capsys):
+def test_a_scene_file_opens_and_what_is_saved_is_one(tmp_path):
     pytest.importorskip("viser")
     scene, looks = tmp_path / "scene.toml", tmp_path / "looks"
     scene.write_text(SCENE)
@@ -251,7 +267,6 @@ def test_a_scene_file_opens_and_what_is_saved_is_one(tmp_path, capsys):
     page._change("scene", "EXR")
     wait_until(lambda: "studio_001.exr" in page._status.content)
     page.close()
-    assert "without [settings]" in capsys.readouterr().err
     assert {path.name for path in looks.iterdir()} == {
         "studio_000.toml",
         "studio_000.py",
@@ -260,6 +275,7 @@ def test_a_scene_file_opens_and_what_is_saved_is_one(tmp_path, capsys):
     saved, *_ = sj.io.load_scene(looks / "studio_000.toml")
     of_exr, camera, settings = sj.io.load_scene(looks / "studio_001.exr")
     assert eqx.tree_equal(saved, of_exr)
+    assert settings.bounces == 1
     lamp, sky = saved.lights[1], saved.lights[0]
     np.testing.assert_allclose(lamp.intensity, 250)
     assert float(sky.rotation) == 30.0
