@@ -36,6 +36,5 @@ def to_display(
 def png_of(image: UInt8[np.ndarray, "height width channels"]) -> bytes:
     """Return the bytes of a PNG file."""
     file = io.BytesIO()
-    gray = image.shape[-1] == 1
-    Image.fromarray(image[..., 0] if gray else image).save(file, format="PNG")
+    Image.fromarray(image[..., 0] if image.shape[-1] == 1 else image).save(file, format="PNG")
     return file.getvalue()

@@ -4,6 +4,8 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+CHANNEL_COLORS = ("#c0392b", "#27853f", "#2c5aa0")  # of three, on white
+
 
 def channel_names(count: int) -> tuple[str, ...]:
     """Return default names of channels: red, green and blue for three of them."""

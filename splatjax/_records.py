@@ -70,12 +70,10 @@ def record(cls: Class) -> Class:
     would be right.
     """
     initialize, signature = cls.__init__, inspect.signature(cls)
-    axes, classes, ranges, linear = {}, {}, {}, []
-    for field in dataclasses.fields(cls):  # ty: ignore[invalid-argument-type]
-        if "valid" in field.metadata:
-            ranges[field.name] = field.metadata["valid"]
-        if "linear" in field.metadata:
-            linear.append(field.name)
+    axes, classes, declared = {}, {}, dataclasses.fields(cls)  # ty: ignore[invalid-argument-type]
+    ranges = {item.name: item.metadata["valid"] for item in declared if "valid" in item.metadata}
+    linear = [item.name for item in declared if "linear" in item.metadata]
+    for field in declared:
         is_tuple = get_origin(field.type) is tuple
         annotation = get_args(field.type)[0] if is_tuple else field.type
         kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
@@ -145,6 +143,11 @@ def as_floats(values: Numbers, dtype: DTypeLike | None = None, name: str = "valu
         ) from None
 
 
+def is_traced(tree: Any) -> bool:
+    """Return whether a tree has a traced array, whose values are unknown."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def check_values(
     name: str,
     values: Any,
@@ -166,7 +169,7 @@ def check_values(
     **Raises:** `ValueError` with the number, or how many entries fail and the first of them.
     """
     kinds = jax.Array | np.ndarray | np.number | int | float
-    is_known = isinstance(values, kinds) and not isinstance(values, Tracer)
+    is_known = isinstance(values, kinds) and not is_traced(values)
     if not is_known or not np.size(values) or not getattr(values, "is_fully_addressable", True):
         return
 

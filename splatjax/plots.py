@@ -9,14 +9,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from numpy.typing import ArrayLike
 
-from splatjax._format import channel_names
+from splatjax._format import CHANNEL_COLORS, channel_names
 from splatjax.fitting import ErrorByCount, relative_error
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
 from splatjax.inverse import Recovery
 from splatjax.io import linear_to_srgb
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
-_RGB = ("#c0392b", "#27853f", "#2c5aa0")
 _POINTS = 400
 # Share of its peak down to which a profile is drawn.
 _TAIL = 1e-7
@@ -137,7 +136,7 @@ def _radii(profile: AbstractProfile) -> Float[Array, " radii"]:
 
 
 def _colors(channels: int) -> Sequence[str]:
-    return _RGB if channels == 3 else [f"C{channel}" for channel in range(channels)]
+    return CHANNEL_COLORS if channels == 3 else [f"C{channel}" for channel in range(channels)]
 
 
 def plot_error_by_count(by_count: ErrorByCount, *, title: str | None = None) -> Figure:
@@ -191,13 +190,17 @@ def plot_pictures(
         dpi=150,
         layout="constrained",
     )
-    grid = figure.subplots(len(rows), len(titles), squeeze=False)
+    grid = figure.subplots(
+        len(rows),
+        len(titles),
+        squeeze=False,
+        subplot_kw={"xticks": [], "yticks": [], "frame_on": False},
+    )
     for number, (line, pictures) in enumerate(zip(grid, rows, strict=True)):
         values = np.stack([np.asarray(picture, np.float64) for picture in pictures])
         brightest = np.quantile(values[values > 0], _BRIGHTEST) if white is None else white
         for axes, picture in zip(line, linear_to_srgb(values / brightest), strict=True):
             axes.imshow(picture, interpolation="nearest")
-            axes.set(xticks=[], yticks=[], frame_on=False)
         if names is not None:
             line[0].set_ylabel(names[number], fontsize="small")
     for axes, title in zip(grid[0], titles, strict=True):
@@ -220,7 +223,7 @@ def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
     """
     rows = len(recovery.pictures)
     figure = Figure(figsize=(9.5, 3.1 * rows), layout="constrained")
-    axes = figure.subplots(rows, 3, squeeze=False)
+    axes = figure.subplots(rows, 3, squeeze=False, subplot_kw={"xticks": [], "yticks": []})
     for number, (row, recovered, residual) in enumerate(
         zip(axes, recovery.pictures, recovery.residuals, strict=True), 1
     ):
@@ -237,8 +240,6 @@ def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
         row[2].set_facecolor("0.8")
         row[2].set_title("recovered less input")
         figure.colorbar(image, ax=row[2], label="% of the picture", shrink=0.8)
-        for ax in row:
-            ax.set(xticks=[], yticks=[])
     figure.suptitle(title or "")
     return figure
 
@@ -248,5 +249,4 @@ def _shown(picture: np.ndarray, bright: float) -> np.ndarray:
     unknown = ~np.all(np.isfinite(picture), axis=-1, keepdims=True)
     gray = np.broadcast_to(np.mean(picture, axis=-1, keepdims=True), (*picture.shape[:2], 3))
     colors = picture if picture.shape[-1] == 3 else gray
-    encoded = linear_to_srgb(np.where(unknown, 0.0, colors) / bright)
-    return np.where(unknown, 0.8, encoded)
+    return np.where(unknown, 0.8, linear_to_srgb(colors / bright))

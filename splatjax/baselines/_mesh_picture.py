@@ -5,10 +5,10 @@ pictures.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax import shading as _shading, splatting as _splatting
+from splatjax._records import is_traced
 from splatjax.render import LightVisibility
 from splatjax.scene import AbstractLightSample, Camera, Frame, Material
 
@@ -97,9 +97,7 @@ def render_texture_space(
     **Source:** d'Eon, Luebke and Enderton 2007; d'Eon and Luebke 2007 (GPU Gems 3, chapter 14).
     """
     if plan is None:
-        if any(
-            isinstance(leaf, Tracer) for leaf in jax.tree.leaves((mesh, lights, material, camera))
-        ):
+        if is_traced((mesh, lights, material, camera)):
             raise ValueError(
                 "plan is None, and under jit, grad or vmap a plan is needed; make it outside, "
                 "plan=plan_texture_space(...)"

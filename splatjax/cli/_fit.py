@@ -107,12 +107,14 @@ class Fit:
         check_output(self.output, (".csv",) if self.all else (".toml",))
         check_output(self.plot, FIGURES)
         most = 8 if self.all else sj.fitting.LeastCount.max_count
-        rules = {
-            "count": (1 <= self.count <= most, f"lie between 1 and {most}"),
-            "error": (self.error is None or self.error > 0, "be positive, such as 0.01"),
-            "g": (self.g is None or abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
-        }
-        check_options(self, rules)
+        check_options(
+            self,
+            {
+                "count": (1 <= self.count <= most, f"lie between 1 and {most}"),
+                "error": (self.error is None or self.error > 0, "be positive, such as 0.01"),
+                "g": (self.g is None or abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
+            },
+        )
         with jax.enable_x64(True):
             self._run_all() if self.all else self._run()
 
@@ -196,8 +198,9 @@ class Fit:
             from splatjax.plots import plot_fit  # loads matplotlib
 
             title = f"{self.medium}, {counted(len(fitted.gaussians.variances), 'Gaussian')}"
-            figure = plot_fit(target.profile, fitted.gaussians, rule=target.rule, title=title)
-            save_figure(figure, self.plot)
+            save_figure(
+                plot_fit(target.profile, fitted.gaussians, rule=target.rule, title=title), self.plot
+            )
 
     def _note_error(self, target: Reference, fitted: sj.fitting.FitResult) -> None:
         """Note a large error, and its cause if the widths of channels differ too much."""
@@ -248,8 +251,9 @@ class Fit:
         else:
             image = sj.io.read_picture(self.medium)
             with sj.io.naming(self.medium):
-                dot = sj.scattering.measure_laser_dot(image, self.mm_per_pixel, power=self.power)
-            measured = dot.profile
+                measured = sj.scattering.measure_laser_dot(
+                    image, self.mm_per_pixel, power=self.power
+                ).profile
         if self.error is None and 2 * self.count > len(measured.radii):
             note(
                 f"{self.medium} has {len(measured.radii)} radii, too few to determine "
@@ -299,14 +303,13 @@ class Fit:
             f"{'profile' if coefficients is None else 'coefficients'} of {self.medium}"
         )
         before = source.get("provenance", "").split("; fitted by splatjax")[0]
-        provenance = "; ".join(filter(None, [before, fitted_by]))
         sj.save_material(
             sj.Material(
                 fitted.gaussians, **surface, single_scattering=target.single, angles=target.angles
             ),
             output,
             profile=target.profile if target.description is None else coefficients,
-            source=source | {"provenance": provenance},
+            source=source | {"provenance": "; ".join(filter(None, [before, fitted_by]))},
             fit={
                 **({} if target.description is None else {"profile": target.description}),
                 "variances_of": "all channels",

@@ -12,7 +12,6 @@ import numpy as np
 import tyro
 
 import splatjax as sj
-from splatjax.plots import plot_pictures
 
 from ._render import Render
 from ._terminal import (
@@ -55,8 +54,7 @@ class Materials:
     pictures: OptionalPath = None
 
     def run(self) -> None:
-        if self.pictures is not None:
-            check_output(self.pictures, (".png", ".jpg"))
+        check_output(self.pictures, (".png", ".jpg"))
         if self.material is not None:
             print(sj.io.material_path(self.material).read_text(encoding="utf-8"), end="")
             return
@@ -67,6 +65,8 @@ class Materials:
             drawn = [_picture(name) for name, *_ in rows]
             drawn += [np.zeros_like(drawn[0])] * (-len(drawn) % _ACROSS)
             lines = [drawn[i : i + _ACROSS] for i in range(0, len(drawn), _ACROSS)]
+            from splatjax.plots import plot_pictures  # loads matplotlib
+
             figure = plot_pictures(lines, [""] * _ACROSS, white=_WHITE, inches=1.6)
             for axes, (name, *_, source) in zip(figure.axes, rows, strict=False):
                 axes.set_title(f"{name}\n{source}", fontsize=6)
@@ -127,10 +127,7 @@ def _row(name: str) -> tuple[str, ...]:
 def _picture(name: str) -> np.ndarray:
     """Render a material on the bust, in its own color."""
     view = Render(material=name, albedo=False, count=20_000, scale=0.2, width=120, height=120)
-    splats, material = view.load()
-    camera = view.camera(lambda: [splats], view.azimuth)
-    scene = sj.Scene(splats, view.lights(material, view.azimuth, view.single_light[0]), material)
-    return np.asarray(sj.render(scene, camera, view.settings).beauty)
+    return np.asarray(sj.render(*view.scene_and_camera(), view.settings).beauty)
 
 
 @dataclass(frozen=True, kw_only=True)

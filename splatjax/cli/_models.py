@@ -103,18 +103,20 @@ def reference(
     if not single_scattering:
         return Reference(profile, chosen.rule, None, description, chosen.angles(medium))
     assert isinstance(profile, sj.scattering.PhotonBeam)
-    single, angles = _parted(sj.scattering.HalfSpace(medium, g))
-    description = f"{description}, without single scattering"
-    return Reference(profile.multiply_scattered(), _BEYOND, single, description, angles)
+    single, half_space = sj.SingleScattering(medium), sj.scattering.HalfSpace(medium, g)
+    return _without_single(profile.multiply_scattered(), single, half_space, description)
 
 
-def _parted(
+def _without_single(
+    profile: sj.gaussians.AbstractProfile,
+    single: sj.SingleScattering,
     half_space: sj.scattering.HalfSpace,
-) -> tuple[sj.SingleScattering, sj.scattering.AngularLaw]:
-    """Return the single scattering to keep apart, and the angles of the rest."""
-    single = sj.SingleScattering(half_space.medium)
+    description: str | None,
+) -> Reference:
+    """Keep single scattering apart from a profile without it, with the angles of the rest."""
     cosines = jnp.asarray(half_space.cosines())
-    return single, half_space.angular_law(single.directional_albedo(cosines))
+    angles = half_space.angular_law(single.directional_albedo(cosines))
+    return Reference(profile, _BEYOND, single, f"{description}, without single scattering", angles)
 
 
 def _walked(
@@ -142,9 +144,8 @@ def _walked(
     half_space = sj.scattering.HalfSpace(coefficients.medium, g)
     if not single_scattering:
         return Reference(profile, _BEYOND, None, description, half_space.angular_law())
-    single, angles = _parted(half_space)
-    description += ", without single scattering"
-    return Reference(profile.without(single), _BEYOND, single, description, angles)
+    single = sj.SingleScattering(coefficients.medium)
+    return _without_single(profile.without(single), single, half_space, description)
 
 
 BATCH = 500  # media in one call

@@ -164,8 +164,10 @@ class Recover:
         )
         settled = recovery.result == optx.RESULTS.successful
         effort = f"{counted(recovery.rounds, 'round')} and {counted(recovery.steps, 'step')}"
-        ended = "found" if settled else "ended"
-        note(f"{time.perf_counter() - begin:6.1f} s  {ended}, after {effort}")
+        note(
+            f"{time.perf_counter() - begin:6.1f} s  {'found' if settled else 'ended'}, "
+            f"after {effort}"
+        )
         if not settled:
             report("kept", recovery.medium)
             note(

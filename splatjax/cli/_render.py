@@ -87,12 +87,14 @@ class Render(PictureOptions):
         options = self
         if self._scene:
             check_alone(self)
-            rendered = self._of_scene(self._scene.path)
+            with stage(f"loading {self._scene.path}"):
+                scene, camera, settings = sj.io.load_scene(self._scene.path)
+            rendered = self._drawn(scene, camera, settings)
             options = replace(self, **self._scene.entries["settings"])
         elif self.splats and self.stream:
             rendered = self._streamed(self.splats)
         else:
-            rendered = self._at_once()
+            rendered = self._drawn(*self.scene_and_camera(), self.settings)
         options.note_unresolved_layers(*rendered[:2])
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
             written = options.write(self.output, *rendered)
@@ -110,21 +112,11 @@ class Render(PictureOptions):
     def record(self, folder: Path, *scene: Any) -> dict[str, Any]:
         if not self._scene:
             return super().record(folder, *scene)
-        versions = {"splatjax": sj.__version__, "jax": jax.__version__}
-        return versions | {"scene": scene_of_file(self._scene, self.settings, folder, *scene)}
-
-    def _at_once(self) -> Rendered:
-        splats, material = self.load()
-        camera = self.camera(lambda: [splats], self.azimuth)
-        scene = sj.Scene(
-            splats, self.lights(material, self.azimuth, self.single_light[0]), material
-        )
-        return self._drawn(scene, camera, self.settings)
-
-    def _of_scene(self, path: Path) -> Rendered:
-        with stage(f"loading {path}"):
-            scene, camera, settings = sj.io.load_scene(path)
-        return self._drawn(scene, camera, settings)
+        return {
+            "splatjax": sj.__version__,
+            "jax": jax.__version__,
+            "scene": scene_of_file(self._scene, self.settings, folder, *scene),
+        }
 
     def _drawn(self, scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings) -> Rendered:
         # Before the preview, which is drawn within the first compilation, so that none is nested.

@@ -71,13 +71,13 @@ class Studio(ViewOptions):
         middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
         target = camera.position + (middle - camera.position) @ forward * forward
         session = Session(scene, camera, target, settings, exposure=self.exposure, skin=skin)
-        place = {"host": self.host, "port": self.port}
-        return Page(session, self.output, as_file, observations=observations, **place)
+        return Page(
+            session, self.output, as_file, observations=observations, host=self.host, port=self.port
+        )
 
     def _of_options(self) -> Opened:
-        splats, material = self.load()
-        lights = self.lights(material, self.azimuth, self.single_light[0])
-        camera, images = self.camera(lambda: [splats], self.azimuth), self.environment_name or ""
+        scene, camera = self.scene_and_camera()
+        images = self.environment_name or ""
         if self.pictures is not None:
             first = tomllib.loads(self.pictures.read_text())["pictures"][0]
             images = [light.get("image", "") for light in first["lights"]]
@@ -85,8 +85,7 @@ class Studio(ViewOptions):
                 i if i in sj.io.ENVIRONMENTS else str(self.pictures.parent / i) for i in images
             ]
         as_file = partial(scene_of_options, self, images, self.settings)
-        skin = sj.io.load_skin(self.material)
-        return sj.Scene(splats, lights, material), camera, self.settings, skin, as_file
+        return scene, camera, self.settings, sj.io.load_skin(self.material), as_file
 
     def _of_file(self, path: Path) -> Opened:
         check_alone(self)

@@ -207,12 +207,10 @@ def _missing(items: Sequence[tuple[Path, ...]]) -> list[int]:
 
 def _check_record(path: Path, record: Mapping[str, Any], items: Sequence[tuple[Path, ...]]) -> None:
     remedy = "give another --output, or delete that folder"
-    if not path.exists():
-        files = [file for item in items for file in item if file.exists()]
-        if files:
-            raise ValueError(f"{files[0]}: has no record of its settings; {remedy}")
-        return
-    before = read_record(path)
+    files = [file for item in items for file in item if file.exists()]
+    if files and not path.exists():
+        raise ValueError(f"{files[0]}: has no record of its settings; {remedy}")
+    before = read_record(path) if path.exists() else record
     changes = [
         f"{name} is {record.get(name)}, but was {before.get(name)}"
         for name in sorted(before.keys() | record.keys())

@@ -20,7 +20,8 @@ from ._terminal import OptionalFloat, Rules, UpAxis, check_options, note, option
 
 # Degrees: the fill is beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
-_SINGLE_LIGHT = -20.0, 30.0, 0.1  # azimuth, elevation, and strength of the fill
+# Options of the single light, by their values where another of them is given.
+_SINGLE_LIGHT = {"light_azimuth": -20.0, "light_elevation": 30.0, "fill": 0.1}
 ENVIRONMENTS = sj.io.ENVIRONMENTS
 _NOT_IN_PICTURES = ("splats", "output", "fps", "quiet", "half", "camera_file", "camera_unit")
 _note_once = functools.cache(note)
@@ -90,7 +91,7 @@ class ViewOptions:
         """
         finite, positive = "be a finite number", "be 1 or more"
         azimuth, elevation, fill = self.single_light
-        for name in ("light_azimuth", "light_elevation", "fill"):
+        for name in _SINGLE_LIGHT:
             if self.environment is not None and getattr(self, name) is not None:
                 raise ValueError(
                     f"{option_name(name)} is for a single light, and --environment replaces it; "
@@ -130,20 +131,17 @@ class ViewOptions:
         )
 
     @property
-    def single_light(self) -> tuple[float, float, float]:
+    def single_light(self) -> tuple[float, ...]:
         """Return azimuth and elevation of the single light, and the strength of its fill."""
-        chosen = self.light_azimuth, self.light_elevation, self.fill
-        azimuth, elevation, fill = (
-            usual if value is None else value
-            for value, usual in zip(chosen, _SINGLE_LIGHT, strict=True)
+        return tuple(
+            usual if (chosen := getattr(self, name)) is None else chosen
+            for name, usual in _SINGLE_LIGHT.items()
         )
-        return azimuth, elevation, fill
 
     @property
     def environment_name(self) -> str | None:
         """Return the environment, by default the studio; `None` for single lights."""
-        chosen = self.light_azimuth, self.light_elevation, self.fill
-        is_lit = any(value is not None for value in chosen)
+        is_lit = any(getattr(self, name) is not None for name in _SINGLE_LIGHT)
         return self.environment or (None if is_lit else "studio")
 
     @functools.cached_property
@@ -166,8 +164,9 @@ class ViewOptions:
         with stage(
             f"reading {self.splats}" if self.splats else f"making the bust of {self.count} splats"
         ):
-            splats = sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
-            splats = self.adjusted(splats)
+            splats = self.adjusted(
+                sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
+            )
         return splats, self.material_for(splats)
 
     def material_for(self, splats: sj.Splats) -> sj.Material:
@@ -188,8 +187,9 @@ class ViewOptions:
             weights = jnp.tile(material.gaussians.weights, 3)
             gaussians = sj.SumOfGaussians(material.gaussians.variances, weights)
             names = "single_scattering", "angles", "medium"
-            terms = {name: getattr(material, name) for name in names}
-            terms = jax.tree.map(lambda leaf: jnp.tile(leaf, 3), terms)
+            terms = jax.tree.map(
+                lambda leaf: jnp.tile(leaf, 3), {name: getattr(material, name) for name in names}
+            )
             material = replace(material, gaussians=gaussians, **terms)
         return material if self.scattering else material.opaque()
 
@@ -197,6 +197,12 @@ class ViewOptions:
         """Return splats at the scale of the options, with or without their maps."""
         splats = splats if self.scale == 1 else splats.scaled(self.scale)
         return splats if self.albedo else splats.without_maps()
+
+    def scene_and_camera(self) -> tuple[sj.Scene, sj.Camera]:
+        """Return the scene, and the camera that sees all of it."""
+        splats, material = self.load()
+        lights = self.lights(material, self.azimuth, self.single_light[0])
+        return sj.Scene(splats, lights, material), self.camera(lambda: [splats], self.azimuth)
 
     def lights(
         self, material: sj.Material, azimuth: float, light_azimuth: float
@@ -289,16 +295,14 @@ class PictureOptions(ViewOptions):
         """Return everything on which the pictures depend: options by name, contents of their files,
         and versions.
         """
-        values = {name: v for name, v in asdict(self).items() if name not in _NOT_IN_PICTURES}
-        options = {option_name(name): value for name, value in values.items()}
-        material = sj.io.material_path(self.material).read_text(encoding="utf-8")
+        options = {option_name(n): v for n, v in asdict(self).items() if n not in _NOT_IN_PICTURES}
         splats = f"{self.splats.name}, {sj.io.fingerprint(self.splats)}" if self.splats else None
         if self.environment and self.environment not in ENVIRONMENTS:
             path = Path(self.environment)
-            options["environment"] = f"{path.name}, {sj.io.fingerprint(path)}"
+            options[option_name("environment")] = f"{path.name}, {sj.io.fingerprint(path)}"
         return options | {
             "splats": splats or "the built-in bust",
-            "contents of --material": material,
+            "contents of --material": sj.io.material_path(self.material).read_text("utf-8"),
             "precision": str(jnp.result_type(float)),
             "splatjax": sj.__version__,
             "jax": jax.__version__,

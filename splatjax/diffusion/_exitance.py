@@ -1,7 +1,6 @@
 """The radiant exitance of the splats in place of their layers: fewer rows to blend."""
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -82,7 +81,7 @@ class ExitancePlan(AbstractDiffusionPlan):
         factors = Sources.of(splats, source).weights
         albedo = jnp.ones_like(source) if splats.albedo is None else splats.albedo.T
         along_splats = jax.tree.map(
-            partial(take_points, chosen=at), (source, splats.areas, albedo, factors)
+            lambda rows: take_points(rows, at), (source, splats.areas, albedo, factors)
         )
 
         @jax.checkpoint

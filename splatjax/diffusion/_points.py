@@ -184,9 +184,8 @@ class LayersAtPoints(eqx.Module):
         - `single_scattering_albedo`: the fraction that leaves a flat surface as single scattering.
         """
         weights, variances = gaussians.weights[:, :, None], self.variances[:, None, None]
-        inputs = weights, variances, single_scattering_albedo, self.means, self.mass[:, None]
-        layers, resolved = self._weigh(*inputs)
-        return layers, resolved[:, 0]
+        mass = self.mass[:, None]
+        return self._weigh(weights, variances, single_scattering_albedo, self.means, mass)
 
     def linear_in_means(
         self, gaussians: SumOfGaussians, single_scattering_albedo: Float[Array, " channels"]
@@ -196,8 +195,9 @@ class LayersAtPoints(eqx.Module):
         **Arguments:** as for `weigh`.
         """
         weights, variances = gaussians.weights[:, :, None], self.variances[:, None, None]
-        inputs = weights, variances, single_scattering_albedo, self.mass[:, None]
-        gain, resolved, local = self._gain(*inputs)
+        gain, resolved, local = self._gain(
+            weights, variances, single_scattering_albedo, self.mass[:, None]
+        )
         gain = weights * gain
         return jnp.sum(gain * (1 - resolved) * local, axis=0), gain * resolved
 
@@ -222,7 +222,7 @@ class LayersAtPoints(eqx.Module):
 
     def _weigh(self, weights, variances, single_scattering_albedo, means, mass):
         gain, resolved, local = self._gain(weights, variances, single_scattering_albedo, mass)
-        return gain * (local + resolved * (means - local)), resolved
+        return gain * (local + resolved * (means - local)), resolved[:, 0]
 
     def exitance(self, gaussians: SumOfGaussians) -> Float[Array, "channels points"]:
         """Compute the radiant exitance `sum_k w_k L_k` of a material without single scattering.

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax._smooth import mean_decay
 from splatjax.scattering import ExactFresnel, Medium
 from splatjax.scene import Material
 
@@ -23,7 +24,6 @@ _COSINES = 8  # over which a law of angles is averaged
 _BRIGHTEST = 2.0  # times an even surface
 _LONGEST = 60.0  # ray, mean free paths
 _ENDLESS = 1e9  # mm: the length of a ray without an end
-_SMALL = 1e-3  # exponent
 
 
 class DiffusionCoefficients(eqx.Module):
@@ -308,10 +308,7 @@ def source_integral(
     near_part, far_part = s - alike * (s - cut), s - alike * cut
     beams = near.irradiance / (entering + mu) * -jnp.expm1(-near_part * (1 + rate))
     exponent = (1 - far_rate) * far_part
-    size = jnp.abs(exponent)
-    is_small, safe = size < _SMALL, jnp.maximum(size, _SMALL)
-    mean = jnp.where(is_small, 1 - 0.5 * size, -jnp.expm1(-safe) / safe)
-    mean = mean * jnp.exp(jnp.maximum(exponent, 0) - s)
+    mean = mean_decay(jnp.abs(exponent)) * jnp.exp(jnp.maximum(exponent, 0) - s)
     beams = beams + far.irradiance / far_entering * far_part * mean
     return diffused + albedo * beams * (1 - albedo / spread * mu * mu / (1 - bend))
 

@@ -109,6 +109,13 @@ class ScreenedKernel(eqx.Module):
         return jax.lax.scan(jax.checkpoint(add), start, rule)[0]
 
 
+def _padded(rows: PyTree[Array], count: int) -> PyTree[Array]:
+    """Append zeros along the last axis, up to a number of entries."""
+    return jax.tree.map(
+        lambda row: jnp.pad(row, [(0, 0)] * (row.ndim - 1) + [(0, count - row.shape[-1])]), rows
+    )
+
+
 class SurfaceSums(eqx.Module):
     """The splats of a body as planes, padded, and their near splats and clusters.
 
@@ -130,20 +137,13 @@ class SurfaceSums(eqx.Module):
                 "splats.weights has factors on Gaussians, which ShapeDiffuser does not read; give "
                 "weights=None, or render with ClusterDiffuser"
             )
-        more = padded_count(splats.count) - splats.count
-        rows = splats.centers.T, splats.normals.T
-        centers, normals = (jnp.pad(row, ((0, 0), (0, more))) for row in rows)
-        areas = jnp.pad(splats.areas, (0, more))
+        rows = splats.centers.T, splats.normals.T, splats.areas
+        centers, normals, areas = _padded(rows, padded_count(splats.count))
         return cls(hierarchy, centers, normals, areas, Clusters.of(centers, areas))
 
     def padded(self, rows: PyTree[Array]) -> PyTree[Array]:
         """Append zeros to rows along the splats, for the padding."""
-
-        def pad(row):
-            more = len(self.areas) - row.shape[-1]
-            return jnp.pad(row, [(0, 0)] * (row.ndim - 1) + [(0, more)])
-
-        return jax.tree.map(pad, rows)
+        return _padded(rows, len(self.areas))
 
     def layers(
         self,

@@ -5,12 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
 from splatjax._format import channel_names, format_numbers
-from splatjax._records import Numbers, as_floats
+from splatjax._records import Numbers, as_floats, is_traced
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
@@ -46,7 +45,7 @@ class ErrorByCount(eqx.Module):
         **Raises:** `ValueError` if no number suffices, and inside `jit`, where the answer depends
         on values.
         """
-        if isinstance(self.error, Tracer):
+        if is_traced(self.error):
             raise ValueError(
                 "the least number of Gaussians depends on values; compute it outside of jit "
                 "and vmap"

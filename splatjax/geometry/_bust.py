@@ -59,8 +59,7 @@ def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
     **Raises:** `ValueError` when `count` is below 1.
     """
     mesh = bust_mesh()
-    points = scatter(mesh, count, seed=seed, relaxations=2)
-    splats = splats_at(mesh, points, rounded=True)
+    splats = splats_at(mesh, scatter(mesh, count, seed=seed, relaxations=2), rounded=True)
     colors = complexion(np.asarray(splats.centers, np.float64))
     return Splats(splats.centers, splats.normals, splats.radii, splats.areas, *colors)
 

@@ -224,8 +224,7 @@ def _carried(
         signs *= signs[ahead]
         ahead = ahead[ahead]
     is_free = np.isin(np.arange(count), free)
-    smooth = agreement * signs[low] * signs[high] > _SMOOTH
-    smooth &= is_free[low] & is_free[high]
+    smooth = (agreement * signs[low] * signs[high] > _SMOOTH) & is_free[low] & is_free[high]
     parts = _components(cost[smooth], low[smooth], high[smooth], count)
     order = np.argsort(parts, kind="stable")
     patches = np.split(order, np.flatnonzero(np.diff(parts[order])) + 1)

@@ -160,9 +160,11 @@ def splats_at(
         lookup_at(mesh, points, getattr(textures, name))
         for name in ("specular", "roughness", "share", "normal")
     )
-    weights = None
-    if share is not None:
-        weights = 1 + share[:, None, None] * (np.asarray(textures.factors) - 1)[None]
+    weights = (
+        None
+        if share is None
+        else 1 + share[:, None, None] * (np.asarray(textures.factors) - 1)[None]
+    )
     if tangent_space is not None:
         normals = perturbed_normals(mesh, points, normals, tangent_space)
     albedo = albedo_at(textures, mesh, points)

@@ -60,8 +60,9 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
     readers = {".json": _transforms, ".gltf": _gltf, ".glb": _gltf}
     reader = _colmap if path.is_dir() else readers.get(existing_file(path).suffix.lower())
     if reader is None:
-        supported = "transforms.json, glTF, or a folder of COLMAP"
-        raise ValueError(f"{path}: is not a file of cameras; give {supported}")
+        raise ValueError(
+            f"{path}: is not a file of cameras; give transforms.json, glTF, or a folder of COLMAP"
+        )
     with one_sentence(path):
         for name, lens, pose in reader(path):
             name = f"{name} {len(cameras)}" if name in cameras else name
@@ -76,10 +77,9 @@ def load_camera(path: StrPath, name: str = "0", *, mm_per_unit: float, up: str =
     cameras = load_cameras(path, mm_per_unit=mm_per_unit, up=up)
     names = {str(number): key for number, key in enumerate(cameras)} | {n: n for n in cameras}
     if name not in names:
-        first = ", ".join([*cameras][:3])
         raise ValueError(
-            f"{path}: has no camera {name!r}; give one of its {len(cameras)} names ({first}, ...), "
-            "or a number from 0"
+            f"{path}: has no camera {name!r}; give one of its {len(cameras)} names "
+            f"({', '.join([*cameras][:3])}, ...), or a number from 0"
         )
     return cameras[names[name]]
 
@@ -111,18 +111,26 @@ def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -
         )
     left, scales, right = np.linalg.svd(pose[:3, :3])
     if not scales[0] < (1 + _SHEAR) * scales[2] or np.linalg.det(left @ right) < 0:
-        axes = pose[:3, :3].tolist()
-        raise ValueError(f"{where}: its axes {axes} are sheared or mirrored; give a rotation")
+        raise ValueError(
+            f"{where}: its axes {pose[:3, :3].tolist()} are sheared or mirrored; give a rotation"
+        )
     axes, place = with_y_up((left @ right).T, up), with_y_up(pose[None, :3, 3], up)[0]
     point = np.asarray([lens.get("cx", width / 2) / width, lens.get("cy", height / 2) / height])
-    shown = focal_y / height, width, height
-    middle = None if np.all(point == 0.5) else point
-    return Camera(mm_per_unit * place, axes, *shown, principal_point=middle)
+    return Camera(
+        mm_per_unit * place,
+        axes,
+        focal_y / height,
+        width,
+        height,
+        principal_point=None if np.all(point == 0.5) else point,
+    )
 
 
 def _has_distortion(where: str | Path, lens: str) -> ValueError:
-    remedy = "undistort the pictures first, such as by `colmap image_undistorter`"
-    return ValueError(f"{where}: its lens is {lens}, with distortion; {remedy}")
+    return ValueError(
+        f"{where}: its lens is {lens}, with distortion; undistort the pictures first, such as by "
+        "`colmap image_undistorter`"
+    )
 
 
 def _transforms(path: Path) -> _Found:
@@ -189,12 +197,16 @@ def _gltf(path: Path) -> _Found:
     for name, camera, matrix in gltf_nodes(path, "camera"):
         if camera["type"] == "perspective":
             lens = camera["perspective"]
-            focal, width = 0.5 * _ROWS / np.tan(0.5 * lens["yfov"]), lens.get("aspectRatio", 1.0)
-            size = {"w": round(_ROWS * width), "h": _ROWS}
-            yield name, {"fl_x": focal, **size}, matrix * [1, -1, -1, 1]
+            pixels = {
+                "fl_x": 0.5 * _ROWS / np.tan(0.5 * lens["yfov"]),
+                "w": round(_ROWS * lens.get("aspectRatio", 1.0)),
+                "h": _ROWS,
+            }
+            yield name, pixels, matrix * [1, -1, -1, 1]
         else:
-            left_out = f"the camera {name!r} is {camera['type']}, and is left out"
-            warnings.warn(f"{path}: {left_out}", stacklevel=2)
+            warnings.warn(
+                f"{path}: the camera {name!r} is {camera['type']}, and is left out", stacklevel=2
+            )
 
 
 def gltf_nodes(path: Path, kind: str) -> _Found:
@@ -235,5 +247,7 @@ def camera_matrices(camera: Camera) -> dict[str, np.ndarray]:
     to_picture = np.diag([*focal * [1, -1], 1.0, 0.0])
     to_picture[2, :2] = np.asarray(camera.principal_pixel, float) / size
     to_picture[2:, 2:] = [[1, 1], [-camera.near, 0]]  # depth from 0 at the near plane to 1
-    matrices = {"worldToCamera": to_camera, "worldToNDC": to_camera @ to_picture}
-    return {name: matrix.astype(np.float32) for name, matrix in matrices.items()}
+    return {
+        "worldToCamera": to_camera.astype(np.float32),
+        "worldToNDC": (to_camera @ to_picture).astype(np.float32),
+    }

@@ -296,8 +296,9 @@ def read_manifest(path: StrPath) -> dict[str, Any]:
     """
     _, header, _ = read_planes(path)
     if not isinstance(header.get(_MANIFEST), str):
-        remedy = "give a picture that `splatjax render` wrote"
-        raise ValueError(f"{path}: has no record of its settings; {remedy}")
+        raise ValueError(
+            f"{path}: has no record of its settings; give a picture that `splatjax render` wrote"
+        )
     with naming(path):
         return json.loads(header[_MANIFEST])
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array
 
 from splatjax._records import check_values
 from splatjax.exports import plain_numbers
@@ -106,9 +105,8 @@ def load_lights(
             if light["type"] == "directional":
                 lights.append(DirectionalLight(direction=direction, irradiance=color))
             elif light["type"] == "spot":
-                cone = light.get("spot", {})
-                defaults = (("innerConeAngle", 0.0), ("outerConeAngle", np.pi / 4))
-                angles = (np.degrees(cone.get(key, default)) for key, default in defaults)
+                cone = {"innerConeAngle": 0.0, "outerConeAngle": np.pi / 4} | light.get("spot", {})
+                angles = np.degrees([cone["innerConeAngle"], cone["outerConeAngle"]])
                 lights.append(SpotLight(position, direction, intensity, *angles))
             else:
                 lights.append(PointLight(position=position, intensity=intensity))
@@ -186,8 +184,9 @@ def look_at(table: Table, width: int, height: int) -> Camera:
     """Make the camera of a table of its place."""
     vectors = [table.numbers(name).tolist() for name in ("position", "target")]
     up = table.numbers("up", [0.0, 1.0, 0.0]).tolist()
-    size = {"width": width, "height": height}
-    return table.make(Camera.look_at, *vectors, up=up, fov=table.number("fov", 25.0), **size)
+    return table.make(
+        Camera.look_at, *vectors, up=up, fov=table.number("fov", 25.0), width=width, height=height
+    )
 
 
 def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
@@ -206,13 +205,6 @@ def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
     raise ValueError(
         f"a file cannot store a {type(light).__name__}; give lights of kinds {', '.join(_LIGHTS)}"
     )
-
-
-def _environment_image(table: Table) -> Array:
-    name = table.text("image")
-    if name in ENVIRONMENTS:
-        return ENVIRONMENTS[name]()
-    return table.make(load_environment, table.folder / name).image
 
 
 def _picture(table: Table, name: str) -> np.ndarray:
@@ -240,7 +232,12 @@ def light_of(table: Table, channels: int) -> AbstractLight:
     if "count" in fields:
         values["count"] = int(table.number("count"))
     if kind == "environment":
-        values["image"] = _environment_image(table)
+        image = table.text("image")
+        values["image"] = (
+            ENVIRONMENTS[image]()
+            if image in ENVIRONMENTS
+            else table.make(load_environment, table.folder / image).image
+        )
         if "directions" in values and values["directions"].ndim == 0:
             values["directions"] = even_directions(int(values["directions"]))
     strength = values.get(light.strength_field, np.ones(1))

@@ -114,8 +114,9 @@ def read_material(tables: Table) -> Material:
         terms["medium"] = profile.medium
     if "single_scattering" in tables.entries:
         table = tables.table("single_scattering", (*MEDIUM_ENTRIES, "strength"))
-        single = table.make(SingleScattering, medium_of(table), table.numbers("strength", 1.0))
-        terms["single_scattering"] = single
+        terms["single_scattering"] = table.make(
+            SingleScattering, medium_of(table), table.numbers("strength", 1.0)
+        )
     if "angles" in tables.entries:
         table = tables.table("angles", ("coefficients",))
         terms["angles"] = table.make(AngularLaw, table.numbers("coefficients"))

@@ -1,7 +1,6 @@
 """Materials as MaterialX documents, in the terms of OpenPBR."""
 
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import jax.numpy as jnp
@@ -39,25 +38,22 @@ def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.
         )
     inputs = openpbr_subsurface(medium)
     inputs["subsurface_radius"] /= mm_per_unit
-    inputs |= {"subsurface_weight": jnp.ones(()), "specular_weight": material.specular}
     inputs |= {
+        "subsurface_weight": jnp.ones(()),
+        "specular_weight": material.specular,
         "specular_ior": jnp.mean(medium.eta),
         "specular_roughness": jnp.sqrt(material.roughness),
     }
     root = ElementTree.Element("materialx", version="1.39", colorspace="lin_rec709")
     surface = ElementTree.SubElement(root, "open_pbr_surface", name=_SURFACE, type="surfaceshader")
     for name, value in inputs.items():
-        _add_input(surface, name, np.asarray(value))
+        kind, size = ("color3", 3) if jnp.ndim(value) else ("float", 1)
+        text = ", ".join(map(str, plain_numbers(np.broadcast_to(value, size))))
+        ElementTree.SubElement(surface, "input", name=name, type=kind, value=text)
     shown = ElementTree.SubElement(root, "surfacematerial", name=_MATERIAL, type="material")
-    attributes = {"name": "surfaceshader", "type": "surfaceshader", "nodename": _SURFACE}
-    ElementTree.SubElement(shown, "input", attributes)
+    ElementTree.SubElement(
+        shown, "input", name="surfaceshader", type="surfaceshader", nodename=_SURFACE
+    )
     ElementTree.indent(root)
     with atomic_path(Path(path)) as temporary:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
-
-
-def _add_input(node: ElementTree.Element, name: str, value: np.ndarray) -> None:
-    numbers: Any = plain_numbers(np.broadcast_to(value, 3) if value.ndim else value)
-    kind = "color3" if value.ndim else "float"
-    text = ", ".join(map(str, numbers)) if value.ndim else str(numbers)
-    ElementTree.SubElement(node, "input", name=name, type=kind, value=text)

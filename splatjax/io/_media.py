@@ -27,8 +27,7 @@ _OPENPBR: dict[str, Any] = {
     "subsurface_scatter_anisotropy": 0.0,
 }
 OPENPBR_ENTRIES = "unit", *_OPENPBR
-MEDIUM_ENTRIES = ("unit", "eta", "sigma_a", "sigma_s_prime", "sigma_s", "g", "color")
-MEDIUM_ENTRIES += ("mean_free_path",)
+MEDIUM_ENTRIES = ("unit", "eta", *sorted(set().union(*_WAYS)))
 SKIN_ENTRIES = tuple(field.name for field in fields(Skin))
 LAYER_ENTRIES = (*MEDIUM_ENTRIES, "optical_depth", "thickness", "thickness_unit")
 
@@ -79,10 +78,11 @@ def layer_of(table: Table) -> Layer | Film:
 
 
 def plain_medium(medium: Medium) -> dict[str, Any]:
-    coefficients = ("sigma_a", "sigma_s_prime", "eta")
     return {
         "unit": COEFFICIENT_UNIT,
-        **{name: plain_numbers(getattr(medium, name)) for name in coefficients},
+        "sigma_a": plain_numbers(medium.sigma_a),
+        "sigma_s_prime": plain_numbers(medium.sigma_s_prime),
+        "eta": plain_numbers(medium.eta),
     }
 
 

@@ -247,7 +247,6 @@ def _placed(piece: Piece, matrix: Float[np.ndarray, "4 4"], up: str, repeats: bo
     normals, uvs = mesh.normals @ np.linalg.pinv(linear), mesh.uvs[:, turn]
     has_uvs = not np.isnan(uvs).all()
     beyond = np.abs(uvs - 0.5).max() - 0.5 if has_uvs else 0.0
-    ends = beyond > _BORDER and not repeats
     faults = {
         f"vertices that are not finite, or beyond {_FARTHEST:g}": not (
             np.abs(vertices) < _FARTHEST
@@ -261,15 +260,18 @@ def _placed(piece: Piece, matrix: Float[np.ndarray, "4 4"], up: str, repeats: bo
             beyond < _MOST_TILES
         ),
         "a texture on faces without texture coordinates": piece.texture and not has_uvs,
-        "a texture that does not repeat, used beyond its border": piece.texture and ends,
+        "a texture that does not repeat, used beyond its border": (
+            piece.texture and not repeats and beyond > _BORDER
+        ),
     }
     for fault, is_there in faults.items():
         if is_there:
             raise ValueError(f"has {fault}; fix or remove them")
     greatest = np.abs(normals).max(axis=1, keepdims=True)
     normals = np.where(greatest > 0, unit(normals / np.where(greatest > 0, greatest, 1.0)), 0.0)
-    vertices, normals = with_y_up(vertices, up), with_y_up(normals, up)
-    return piece._replace(mesh=Mesh(vertices, faces, normals, uvs, mesh.colors))
+    return piece._replace(
+        mesh=Mesh(with_y_up(vertices, up), faces, with_y_up(normals, up), uvs, mesh.colors)
+    )
 
 
 def _joined(pieces: Sequence[Piece], mm_per_unit: float, flip_v: bool) -> Mesh:

@@ -253,8 +253,11 @@ def _splat_fields(
                 f"{path}: its vertices have {', '.join(single) or 'no rows'}, and not all of "
                 f"{' '.join(names)}; write all of them"
             )
-    matches = [match for match in map(_WEIGHT.fullmatch, single) if match]
-    factors = sorted((tuple(map(int, match.groups())), match[0]) for match in matches)
+    factors = sorted(
+        (tuple(map(int, match.groups())), match[0])
+        for match in map(_WEIGHT.fullmatch, single)
+        if match
+    )
     if factors:
         shape = factors[-1][0]
         if [place for place, _ in factors] != [(k + 1, c + 1) for k, c in np.ndindex(shape)]:
@@ -262,12 +265,11 @@ def _splat_fields(
                 f"{path}: its vertices have {', '.join(name for _, name in factors)}, and not one "
                 "for each Gaussian and channel: write all of them"
             )
-        values = _values(path, "weights", {name: single[name] for _, name in factors}, 1.0)
-        fields["weights"] = values.reshape(-1, *shape)
-    fields["centers"] = with_y_up(fields["centers"], up)
-    if fields["normals"] is not None:
-        fields["normals"] = with_y_up(fields["normals"], up)
-    return fields
+        fields["weights"] = _values(
+            path, "weights", {name: single[name] for _, name in factors}, 1.0
+        ).reshape(-1, *shape)
+    vectors = {name: fields[name] for name in ("centers", "normals") if fields[name] is not None}
+    return fields | {name: with_y_up(values, up) for name, values in vectors.items()}
 
 
 def _check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: bool) -> None:
@@ -306,7 +308,6 @@ def _values(
             f"vertices); it must be finite and {expected}; fix it, or remove it"
         )
     if field == "normals":
-        values = values / np.abs(values).max(axis=0)
-        return unit(values.T)
+        return unit((values / np.abs(values).max(axis=0)).T)
     values = srgb_to_linear(values) if is_encoded else values
     return values.T if len(columns) > 1 else values[0]

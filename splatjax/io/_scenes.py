@@ -74,9 +74,11 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
         material = material if splats.albedo is None else material.white()
     lights = [light_of(light, material.channels) for light in file.tables("lights", LIGHT_ENTRIES)]
     table = file.table("settings", ("bounces", "diffusion"))
-    diffuser = DIFFUSERS[table.one_of("diffusion", DIFFUSERS, "clusters")]
-    bounces = int(table.number("bounces", 0.0))
-    settings = table.make(RenderSettings, bounces=bounces, diffuser=diffuser)
+    settings = table.make(
+        RenderSettings,
+        diffuser=DIFFUSERS[table.one_of("diffusion", DIFFUSERS, "clusters")],
+        bounces=int(table.number("bounces", 0.0)),
+    )
     scene = file.make(Scene, splats, lights, material)
     return scene, _camera(file.table("camera", _CAMERA)), settings
 
@@ -140,8 +142,11 @@ def plain_scene(
     settings: RenderSettings,
 ) -> dict[str, Any]:
     """Return the contents of a scene's file; [splats] and [[lights]] are given."""
-    pose = {name: getattr(camera, name) for name in (*_POSE, "principal_point")}
-    pose = {name: plain_numbers(value) for name, value in pose.items() if value is not None}
+    pose = {
+        name: plain_numbers(value)
+        for name in (*_POSE, "principal_point")
+        if (value := getattr(camera, name)) is not None
+    }
     kinds = {type(diffuser): name for name, diffuser in DIFFUSERS.items()}
     diffusion = kinds.get(type(settings.diffuser), "clusters")
     return {
@@ -158,8 +163,10 @@ def _splats(table: Table) -> Splats:
         splats = bust(int(table.number("bust")))
     else:
         is_mesh = "mesh" in table.entries
-        mm_per_unit = table.number("mm_per_unit", None if is_mesh else 1.0)
-        unit: dict[str, Any] = {"mm_per_unit": mm_per_unit, "up": table.entries.get("up", "y")}
+        unit: dict[str, Any] = {
+            "mm_per_unit": table.number("mm_per_unit", None if is_mesh else 1.0),
+            "up": table.entries.get("up", "y"),
+        }
         body = table.folder / table.text("mesh" if is_mesh else "file")
         count = int(table.number("count", 200_000.0))
         splats = sample_mesh(body, count, **unit) if is_mesh else read_splats(body, **unit)
@@ -179,5 +186,4 @@ def _camera(table: Table) -> Camera:
         return look_at(table, width, height)
     names = *_POSE, *(entries.keys() & {"principal_point"})
     pose = {name: table.numbers(name) for name in names}
-    near = table.number("near", 1e-2)
-    return table.make(Camera, **pose, width=width, height=height, near=near)
+    return table.make(Camera, **pose, width=width, height=height, near=table.number("near", 1e-2))

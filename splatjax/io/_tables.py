@@ -58,8 +58,7 @@ class Table:
             )
 
     def table(self, name: str, names: Iterable[str]) -> "Table":
-        inner = f"{self.name} {name}".strip()
-        return Table(self.path, inner, self.entries.get(name), names)
+        return Table(self.path, f"{self.name} {name}".strip(), self.entries.get(name), names)
 
     def tables(self, name: str, names: Iterable[str]) -> "list[Table]":
         """Return a list of tables within this one, from 1."""

@@ -3,7 +3,6 @@ rendered once.
 """
 
 import dataclasses
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -123,8 +122,9 @@ def _diffusion_basis(
                 shaded.specular,
             )
 
-        light_at = partial(passes.light, kept=light, derivative=derivative)
-        (*rows, specular), visible = passes.picture(camera, light_at, read)
+        (*rows, specular), visible = passes.picture(
+            camera, lambda at: passes.light(at, kept=light, derivative=derivative), read
+        )
         layers, per_exitance = jax.tree.map(in_a_row, rows)
         x, y = visible.grid.columns_and_rows(visible.tiles)
         x, y = jnp.minimum(x, camera.width - 1), jnp.minimum(y, camera.height - 1)
@@ -236,15 +236,12 @@ def relighting_basis(
 def _relighting_basis(
     scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, light: Transfer | None
 ) -> RelightingBasis:
-    def coefficients(scene):
-        return scene.lights[0].coefficients
-
-    template = coefficients(scene)
+    template = scene.lights[0].coefficients
     kept = transfer(scene, plan, settings) if light is None else light
 
     def under(harmonics: Float[Array, " harmonics"]):
         gray = jnp.broadcast_to(harmonics[:, None], template.shape)
-        lit = eqx.tree_at(coefficients, scene, gray)
+        lit = eqx.tree_at(lambda scene: scene.lights[0].coefficients, scene, gray)
         frame = render(lit, camera, settings, plan, light=kept)
         return frame.beauty, frame.coverage, frame.overflow
 

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 import equinox as eqx
 import jax
 import numpy as np
-from jax.core import Tracer
 
 from splatjax._memory import check_memory
-from splatjax._records import check_class
+from splatjax._records import check_class, is_traced
 from splatjax.scene import Camera, DiskLight, RectangleLight, Scene, Splats, lights_by_kind
 
 # Lower bounds: a picture that needs more than the free memory by these does not fit.
@@ -45,7 +44,7 @@ def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
     check_class("camera", camera, Camera)
     check_channels(scene)
     leaves = [leaf for leaf in jax.tree.leaves((scene, camera)) if isinstance(leaf, jax.Array)]
-    if any(isinstance(leaf, Tracer) or not leaf.is_fully_addressable for leaf in leaves):
+    if is_traced(leaves) or not all(leaf.is_fully_addressable for leaf in leaves):
         return
     count, pixels = scene.splats.count, camera.width * camera.height
     check_memory(
@@ -116,7 +115,11 @@ def _warnings(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
     )
     for number, light in enumerate(scene.lights, 1):
         is_flat = isinstance(light, RectangleLight | DiskLight)
-        if is_lit and is_flat and np.all((centers - np.asarray(light.center)) @ _normal(light) < 0):
+        if (
+            is_lit
+            and is_flat
+            and np.all((centers - np.asarray(light.center)) @ np.cross(*light.axes()) < 0)
+        ):
             yield (
                 f"light {number}, a {type(light).__name__}, shines away from the body; "
                 "turn it around"
@@ -146,12 +149,6 @@ def _warnings(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
                 f"the size of the body is {size:.3g} mm, and light travels {reach:.3g} mm "
                 "below its surface; check the units (mm), or scale the body by Splats.scaled"
             )
-
-
-def _normal(light: RectangleLight | DiskLight) -> np.ndarray:
-    if isinstance(light, DiskLight):
-        return np.asarray(light.direction)
-    return np.cross(*np.asarray(light.edges))
 
 
 def _winding_number(centers, normals, areas, camera: Camera) -> float:

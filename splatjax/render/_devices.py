@@ -10,11 +10,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from splatjax._combination import AbstractCombination, DeviceMesh, lay_out
+from splatjax._records import is_traced
 from splatjax.gaussians import pad_gaussians
 from splatjax.scene import AbstractLightSample, Frame, Scene, lights_by_kind
 
@@ -38,12 +38,12 @@ class OwnRows(NamedTuple):
     def of(self, record: Record, *names: str) -> Record:
         """Remove the padding Gaussians from fields of a record."""
         padded = {name: getattr(record, name) for name in names}
-        rows = jax.tree.map(lambda rows: take_rows(rows, self.gaussians), padded)
+        rows = jax.tree.map(lambda rows: rows_or_last(rows, self.gaussians), padded)
         return dataclasses.replace(record, **rows)
 
     def frame(self, frame: Frame) -> Frame:
         """Remove the padding from a frame."""
-        shadow = take_rows(frame.shadow, self.lights)
+        shadow = rows_or_last(frame.shadow, self.lights)
         shown = self.of(frame, "layers", "weights", "unresolved_fraction")
         return dataclasses.replace(shown, shadow=shadow)
 
@@ -75,12 +75,11 @@ def pad_scene(
     layers = len(plan.diffusion.shown(scene).material.gaussians.variances)
     shown = np.arange(min(plan.gaussians, layers))
     own_rows = OwnRows(np.arange(len(scene.lights)), shown)
-    leaves = jax.tree.leaves((scene, light, trees))
-    if plan.mesh is not None or any(isinstance(leaf, Tracer) for leaf in leaves):
-        return scene, plan, light and resize_visibility(light, scene), own_rows
+    if plan.mesh is not None or is_traced((scene, light, trees)):
+        return scene, plan, None if light is None else resize_visibility(light, scene), own_rows
     splats, lights, shadows = scene.splats, scene.lights, plan.shadows
     if 0 < splats.count < len(plan.order):
-        splats = jax.tree.map(lambda leaf: take_rows(leaf, np.arange(len(plan.order))), splats)
+        splats = jax.tree.map(lambda leaf: rows_or_last(leaf, np.arange(len(plan.order))), splats)
     if all(isinstance(light, AbstractLightSample) and light.strength_field for light in lights):
         groups = lights_by_kind(lights)
         numbered = [light for group in groups for light in group + _pad_lights(group, len(lights))]
@@ -94,7 +93,7 @@ def pad_scene(
     gaussians = pad_gaussians(material.gaussians)
     if splats.weights is not None:
         rows = np.arange(len(gaussians.variances))
-        weights = take_rows(splats.weights.swapaxes(0, 1), rows).swapaxes(0, 1)
+        weights = rows_or_last(splats.weights.swapaxes(0, 1), rows).swapaxes(0, 1)
         splats = dataclasses.replace(splats, weights=weights)
     material = eqx.tree_at(
         lambda material: (material.gaussians, material.angles),
@@ -105,7 +104,7 @@ def pad_scene(
     counts = {"splats": splats.count, "gaussians": len(gaussians.variances)}
     plan = dataclasses.replace(plan, shadows=shadows, **counts)
     scene = Scene(splats, lights, material)
-    return scene, plan, light and resize_visibility(light, scene), own_rows
+    return scene, plan, None if light is None else resize_visibility(light, scene), own_rows
 
 
 def _pad_lights(
@@ -118,13 +117,13 @@ def _pad_lights(
     return [(number, dark)] * ((1 << max(len(group) - 1, 2).bit_length()) - len(group))
 
 
-def take_rows(
+def rows_or_last(
     rows: Shaped[Array, "rows ..."], places: Int[np.ndarray, " places"]
 ) -> Shaped[Array, "places ..."]:
     """Take rows, the last one for indices beyond them. Outside `jit` nothing is compiled."""
     if np.array_equal(places, np.arange(len(rows))):
         return rows
-    if isinstance(rows, Tracer):
+    if is_traced(rows):
         return jnp.take(rows, places, axis=0, mode="clip")
     return jax.device_put(np.take(np.asarray(rows), places, axis=0, mode="clip"))
 
@@ -133,7 +132,7 @@ def resize_visibility(light: Kept, scene: Scene) -> Kept:
     """Pad or cut the rows of visibility of each kind of lights to the samples of a scene."""
     groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
     visibility = [
-        rows if rows is None else take_rows(rows, np.arange(len(g))) for rows, g in groups
+        rows if rows is None else rows_or_last(rows, np.arange(len(g))) for rows, g in groups
     ]
     return dataclasses.replace(light, visibility=visibility)
 

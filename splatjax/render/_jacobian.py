@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import TypeVar
 
 import equinox as eqx
@@ -141,8 +140,9 @@ def _picture_jacobian(
             per_exitance = shaded.radiance_per_exitance[None]
             return shaded, per_exitance * of_weights, per_exitance * of_variances
 
-        light_at = partial(passes.light, derivative=True)
-        (shaded, *derivatives), visible = passes.picture(camera, light_at, read)
+        (shaded, *derivatives), visible = passes.picture(
+            camera, lambda at: passes.light(at, derivative=True), read
+        )
         pictures = [jnp.moveaxis(visible.picture(values), 2, 0) for values in derivatives]
         return PictureJacobian(compose(scene, shaded, visible), *pictures)
 

@@ -87,12 +87,11 @@ class Passes(eqx.Module):
     plan: Plan
     combination: AbstractCombination
 
-    def visibility(self, transfer: Transfer | None = None) -> LightVisibility:
-        """Render the shadow maps and look up the splats in them (pass 1), or read a result."""
-        scene = self.scene
-        if transfer is not None:
-            return LightVisibility(stack_lights(scene.lights), transfer.visibility, transfer.needed)
-        return cast_shadows(scene, self.plan.shadows, self.settings.splatting, self.combination)
+    def visibility(self) -> LightVisibility:
+        """Render the shadow maps and look up the splats in them (pass 1)."""
+        return cast_shadows(
+            self.scene, self.plan.shadows, self.settings.splatting, self.combination
+        )
 
     def light(
         self,
@@ -112,7 +111,11 @@ class Passes(eqx.Module):
         if isinstance(kept, SplatLight):
             return kept if at is None else kept.take(at)
         splats, material = self.scene.splats, self.scene.material
-        light = self.visibility(kept)
+        light = (
+            self.visibility()
+            if kept is None
+            else LightVisibility(stack_lights(self.scene.lights), kept.visibility, kept.needed)
+        )
         irradiance, bounced, beams, bounce_needed = self.irradiance(light)
         source, added, slopes, solved = irradiance.source, None, None, None
         kernel, combination = self.settings.kernel, self.combination

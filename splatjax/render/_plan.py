@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import Array, Bool, Float, Int
@@ -15,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import Result, rounded_up
 from splatjax._combination import DeviceMesh
+from splatjax._records import is_traced
 from splatjax.cache import kept, reuse_capacity
 from splatjax.gaussians import pad_gaussians
 from splatjax.scene import (
@@ -200,7 +200,7 @@ def plan_unless_traced(
     if plan is not None:
         check_plan(plan, scene, mesh)
         return plan
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((scene, camera))):
+    if is_traced((scene, camera)):
         raise ValueError(
             "plan is None, and under jit, grad or vmap a plan is needed: make one outside, "
             "plan=splatjax.make_plan(scene, camera, settings)"

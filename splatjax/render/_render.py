@@ -1,7 +1,6 @@
 """Pictures with all layers, the light of a body without a camera, and pass 4 alone."""
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -73,8 +72,9 @@ def _render(
     light: SplatLight | Transfer | None,
 ) -> Frame:
     def picture(passes, camera, light=None):
-        light_at = partial(passes.light, kept=light)
-        shaded, visible = passes.picture(camera, light_at, lambda shaded, *_: shaded)
+        shaded, visible = passes.picture(
+            camera, lambda at: passes.light(at, kept=light), lambda shaded, *_: shaded
+        )
         return compose(plan.diffusion.shown(passes.scene), shaded, visible)
 
     return on_devices(picture, scene, settings, plan, camera, placed=light)

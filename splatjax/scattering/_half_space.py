@@ -10,11 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import Numbers, as_floats, check_values, numbers, record, valid
+from splatjax._records import Numbers, as_floats, check_values, is_traced, numbers, record, valid
 
 from ._medium import Layer, Medium, reflectance
 from ._quadrature import unit_legendre
@@ -50,7 +49,7 @@ class AngularLaw(eqx.Module):
         powers = len(self.coefficients)
         if not 0 < powers <= 8:
             raise ValueError(f"AngularLaw.coefficients has {powers} powers; give 1 to 8")
-        if isinstance(self.coefficients, Tracer | jax.ShapeDtypeStruct):
+        if is_traced(self.coefficients) or isinstance(self.coefficients, jax.ShapeDtypeStruct):
             return
         values = np.vander(np.linspace(0, 1, 33), powers, increasing=True) @ np.asarray(
             self.coefficients

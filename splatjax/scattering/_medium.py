@@ -7,11 +7,10 @@ import abc
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, numbers, record, valid
+from splatjax._records import check_values, is_traced, numbers, record, valid
 
 from ._quadrature import unit_interval
 
@@ -134,7 +133,7 @@ def check_stack(layers: tuple[Layer | Film, ...]) -> None:
         raise ValueError(f"layers have {sorted(counts)} channels; give all the same number")
     for number, layer in enumerate(layers[:-1], start=1):
         thickness = layer.thickness if isinstance(layer, Layer) else 0.0
-        if not isinstance(thickness, Tracer) and np.isinf(thickness):
+        if not is_traced(thickness) and np.isinf(thickness):
             raise ValueError(
                 f"layer {number} of {len(layers)} is infinitely thick; only the lowest may be"
             )

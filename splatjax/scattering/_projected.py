@@ -30,10 +30,6 @@ class Projected(AbstractProfile):
 
     singular: ClassVar[bool] = True
 
-    @property
-    def channels(self) -> int:
-        return self.matrix.shape[1]
-
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return jnp.dot(self.profile(r), self.matrix)
 

@@ -224,10 +224,6 @@ class Skin(eqx.Module):
         metadata=valid("between 380 and 780 (nm)", lambda x: (x >= _SHORTEST) & (x <= _LONGEST)),
     )
 
-    @property
-    def channels(self) -> int:
-        return len(self.wavelengths)
-
     @jit_unless_traced
     def media(self) -> tuple[Medium, Medium]:
         """Compute the coefficients of epidermis and dermis."""
@@ -257,7 +253,7 @@ class Skin(eqx.Module):
         angles by light transport.
         """
         epidermis, dermis = self.layers()
-        return HalfSpace(dermis.medium, jnp.broadcast_to(self.g, self.channels), epidermis)
+        return HalfSpace(dermis.medium, jnp.full_like(self.wavelengths, self.g), epidermis)
 
     def profile(self) -> "SkinProfile":
         """Return the profile of light along the normal, with the total of light transport."""
@@ -294,10 +290,6 @@ class SkinProfile(AbstractProfile):
 
     singular: ClassVar[bool] = True
     has_separate_channels: ClassVar[bool] = True
-
-    @property
-    def channels(self) -> int:
-        return self.dermis.channels
 
     @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:

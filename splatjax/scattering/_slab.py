@@ -174,10 +174,6 @@ class AbstractSlabProfile(AbstractProfile):
             layer.check_diffusion()
 
     @property
-    def channels(self) -> int:
-        return self.top.channels
-
-    @property
     def top(self) -> Layer:
         """The uppermost layer that scatters."""
         return self._scattering()[0]

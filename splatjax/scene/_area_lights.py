@@ -64,14 +64,12 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
         axes, (normal, area) = self.axes(), self.normal_and_area()
         positions = self.center[None] + jnp.asarray(self.sample_offsets(), axes.dtype) @ axes
 
-        def sample(position):
-            return EmitterStratum(
-                position=position,
-                intensity=self.radiance * (area / self.count),
-                normal=normal,
-                cast_shadows=self.cast_shadows,
-            )
-
+        sample = eqx.Partial(
+            EmitterStratum,
+            intensity=self.radiance * (area / self.count),
+            normal=normal,
+            cast_shadows=self.cast_shadows,
+        )
         return jax.vmap(sample)(positions)
 
     def highlight(self) -> AbstractHighlight:
@@ -143,8 +141,7 @@ class RectangleLight(AbstractAreaLight):
         **Arguments:** mm; `settings` are `count` and `cast_shadows`.
         """
         center = as_floats(center)
-        towards = as_floats(target) - center
-        right, down = _across(towards)
+        right, down = _across(as_floats(target) - center)
         return cls(center, radiance, jnp.stack([width * right, height * down]), **settings)
 
     def axes(self) -> Float[Array, "2 3"]:

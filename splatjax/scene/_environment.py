@@ -100,8 +100,7 @@ class EnvironmentLight(AbstractExtendedLight):
         return jnp.stack(tilt).reshape(3, 3) @ jnp.stack(rows).reshape(3, 3)
 
     def stacked_samples(self) -> AbstractLightSample:
-        height = self.image.shape[0]
-        directions, solid_angles = pixel_directions(height, self.image.dtype)
+        directions, solid_angles = pixel_directions(len(self.image), self.image.dtype)
         brightness = jnp.mean(self.image, axis=-1)
         mean = jnp.sum(brightness * solid_angles) / (4 * jnp.pi)
         relative = brightness / jnp.where(mean > 0, mean, 1.0)
@@ -113,22 +112,17 @@ class EnvironmentLight(AbstractExtendedLight):
             ],
             axis=-1,
         )
-        if self.directions is None:
-            strata = self._stratify(moments)
-        else:
-            strata = self._distribute(directions, moments)
-
+        strata = (
+            self._stratify(moments)
+            if self.directions is None
+            else self._distribute(directions, moments)
+        )
         towards, irradiance = strata[:, -5:-2], strata[:, :-5] * self.strength[None]
         is_filled = jnp.sum(towards**2, axis=-1, keepdims=True) > 0
         towards = jnp.where(is_filled, towards, jnp.asarray([[0.0, 1.0, 0.0]], towards.dtype))
         towards = towards / jnp.linalg.norm(towards, axis=-1, keepdims=True) @ self.to_world().T
-
-        def sample(towards, irradiance):
-            return DistantStratum(
-                direction=-towards, irradiance=irradiance, cast_shadows=self.cast_shadows
-            )
-
-        return jax.vmap(sample)(towards, irradiance)
+        sample = eqx.Partial(DistantStratum, cast_shadows=self.cast_shadows)
+        return jax.vmap(sample)(-towards, irradiance)
 
     def _distribute(
         self, directions: Float[Array, "height width 3"], moments: Float[Array, "height width sums"]

@@ -83,12 +83,7 @@ class HarmonicLight(AbstractExtendedLight):
     def stacked_samples(self) -> AbstractLightSample:
         directions = jnp.asarray(even_directions(self.count), self.coefficients.dtype)
         irradiance = 4 * jnp.pi / self.count * self.radiance(directions)
-
-        def sample(direction, irradiance):
-            return HarmonicStratum(
-                direction=direction, irradiance=irradiance, cast_shadows=self.cast_shadows
-            )
-
+        sample = eqx.Partial(HarmonicStratum, cast_shadows=self.cast_shadows)
         return jax.vmap(sample)(-directions, irradiance)
 
     def highlight(self) -> AbstractHighlight:
@@ -153,8 +148,7 @@ def studio(height: int = 64) -> Float[Array, "height width 3"]:
     """
     directions, image = pixel_directions(height)[0], jnp.full(3, 0.04)[None, None]
     for azimuth, elevation, half_width, half_height, radiance in _SOFTBOXES:
-        axes = _frame(azimuth, elevation)
-        x, y, along = (jnp.tensordot(directions, axis, 1) for axis in axes)
+        x, y, along = (jnp.tensordot(directions, axis, 1) for axis in _frame(azimuth, elevation))
         edge = jnp.maximum(jnp.abs(x) / half_width, jnp.abs(y) / half_height)
         shown = jax.nn.sigmoid(20 * (1 - edge / jnp.maximum(along, 1e-3)))
         image = image + shown[..., None] * jnp.asarray(radiance)[None, None]

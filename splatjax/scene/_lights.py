@@ -11,11 +11,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, numbers, record
+from splatjax._records import check_values, is_traced, numbers, record
 from splatjax._smooth import smooth_step
 from splatjax.gaussians import gaussian
 
@@ -151,7 +150,7 @@ def _rows(leaf: Float[Array, "rows ..."]) -> Sequence[Float[Array, "..."]]:
     """Return the rows of an array. Outside `jit` nothing is compiled, where each row would be a
     kernel of its own.
     """
-    if isinstance(leaf, Tracer):
+    if is_traced(leaf):
         return jnp.unstack(leaf)
     return jax.device_put(list(np.asarray(leaf)))
 

@@ -9,12 +9,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import take_rows
 from splatjax._display import png_of, to_display
-from splatjax._records import Numbers, as_floats, check_values, numbers, record, several, valid
+from splatjax._records import (
+    Numbers,
+    as_floats,
+    check_values,
+    is_traced,
+    numbers,
+    record,
+    several,
+    valid,
+)
 
 from ._lights import AbstractLight
 from ._material import Material
@@ -97,7 +105,7 @@ class Camera(eqx.Module):
         points = as_floats([eye, target, up], name="eye, target and up")
         eye, target, up = points
         forward = target - eye
-        if not isinstance(points, Tracer):
+        if not is_traced(points):
             checked, direction = np.asarray(points, np.float64), np.asarray(forward, np.float64)
             check_values(
                 "eye, target and up",

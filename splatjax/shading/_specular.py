@@ -224,15 +224,16 @@ def directional_albedo(
         x = 2 * jnp.sqrt(jnp.clip(mu, _LEAST_MU, 1.0)) - 1
         return jnp.sum(_chebyshev_basis(x, _MU_NODES) * along_mu, axis=0)
 
-    def mapped(mu, roughness):
-        return over_mu(mu, coefficients @ _roughness_basis(roughness))
-
     if roughness.ndim == 0:
         along_mu = (coefficients @ _roughness_basis(roughness))[:, None]
         albedo = map_chunks(lambda mu: over_mu(mu, along_mu), mu.reshape(-1), at_once=_AT_ONCE)
     else:
         mu, roughness = jnp.broadcast_arrays(mu, roughness)
-        albedo = map_chunks(mapped, mu.reshape(-1), roughness.reshape(-1), at_once=_AT_ONCE)
+        albedo = map_chunks(
+            lambda mu, m: over_mu(mu, coefficients @ _roughness_basis(m)),
+            *(mu.reshape(-1), roughness.reshape(-1)),
+            at_once=_AT_ONCE,
+        )
     return jnp.clip(albedo.reshape(mu.shape), 0.0, 1.0)
 
 

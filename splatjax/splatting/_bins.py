@@ -41,10 +41,6 @@ class BinCapacity(eqx.Module):
             min(max(chunks, grid.half), grid.padded_count // grid.lanes),
         )
 
-    def coarse(self, grid: TileGrid) -> "BinCapacity":
-        """Round up to the next power of two, and to all chunks."""
-        return BinCapacity(1 << self.pairs.bit_length(), grid.padded_count // grid.lanes)
-
 
 class Bins(eqx.Module):
     """Items per tile.

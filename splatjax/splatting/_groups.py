@@ -147,13 +147,9 @@ class Sightlines(eqx.Module):
         directions = np.concatenate([lines, -lines]).astype(centers.dtype)
         return cls(jnp.asarray(directions), jnp.asarray(seen.T), size)
 
-    @property
-    def groups(self) -> int:
-        return len(self.seen)
-
     def first_splats(self) -> Int[Array, " groups"]:
         """Return the first splat of each group of this device."""
-        return jnp.arange(self.groups, dtype=jnp.int32) * self.size
+        return jnp.arange(len(self.seen), dtype=jnp.int32) * self.size
 
     def irradiance(
         self,
@@ -183,7 +179,7 @@ class Sightlines(eqx.Module):
             received = cosines / jnp.where(total > 0, total, 1.0) @ light
             return received.reshape(len(seen), -1)
 
-        rows = normals.reshape(self.groups, 3 * self.size)
+        rows = normals.reshape(len(self.seen), 3 * self.size)
         at_once = max(_AT_ONCE // (self.size * len(self.directions)), 1)
         received = map_chunks(of_groups, rows, self.seen, at_once=at_once)
         return received.reshape(-1, len(exitance)).T

@@ -121,7 +121,7 @@ class TilePlan(AbstractRasterPlan):
             plan = self.rasterizer.make_plan([joined], views, settings)
         # Coarse capacities, so that other bodies and pictures of the size share the program.
         grid = self.rasterizer.grid(views[0])
-        bins = plan.bins.coarse(grid)
+        bins = BinCapacity(1 << plan.bins.pairs.bit_length(), grid.padded_count // grid.lanes)
         front = bins.chunks * grid.lanes
         seen = min(1 << plan.splats.bit_length(), joined.count)
         coarse = TilePlan(self.rasterizer, seen, bins, SurfaceCapacity(front, front))

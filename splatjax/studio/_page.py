@@ -91,7 +91,7 @@ class Page:
         camera.fov = float(np.radians(session.fov))
         self._add_controls(server.gui)
         server.scene.on_click()(self._pick)
-        server.on_client_connect(self._join)
+        server.on_client_connect(lambda client: client.camera.on_update(self._look))
         server.on_client_disconnect(
             lambda client: self._joined.remove(client) if client in self._joined else None
         )
@@ -115,8 +115,9 @@ class Page:
         gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         self._status = gui.add_markdown("starting ...")
         gui.add_button("first view").on_click(lambda _: self._look_again())
-        buttons = gui.add_button_group("save", tuple(SUFFIXES))
-        buttons.on_click(lambda event: self._change(event.target.value))
+        gui.add_button_group("save", tuple(SUFFIXES)).on_click(
+            lambda event: self._change(event.target.value)
+        )
         self._panel = Panel(gui, self._session, self._change)
         self._pixel = gui.add_markdown("click the picture for the parts of a pixel")
         if self._observations:
@@ -169,9 +170,6 @@ class Page:
     def _controls(self) -> Controls:
         return self._panel.controls(self._place)
 
-    def _join(self, client: Any) -> None:
-        client.camera.on_update(self._look)
-
     def _look(self, camera: Any) -> None:
         place, start = np.asarray([camera.position, camera.look_at]), self._session.start
         near = _NEAR * np.linalg.norm(place[0] - place[1])
@@ -206,8 +204,7 @@ class Page:
             return "pixel {}, {} shows no surface".format(*self._picked)
         names = channel_names(len(parts["radiance"]))
         rows = [["pixel {}, {}".format(*self._picked), *names], ["---"] * (len(names) + 1)]
-        for name, values in parts.items():
-            rows.append([name, *(f"{value:.3g}" for value in values)])
+        rows += [[name, *(f"{value:.3g}" for value in values)] for name, values in parts.items()]
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
     def _send(self, client: Any) -> None:

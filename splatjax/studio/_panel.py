@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from splatjax._format import channel_names, format_numbers
+from splatjax._format import CHANNEL_COLORS, channel_names, format_numbers
 from splatjax.scattering import Medium
 
 from ._controls import COEFFICIENTS, LAYERS, Controls
@@ -31,7 +31,6 @@ _PIGMENTS = {
     "thickness": ("epidermis, mm", 0.01, 0.5),
     "scattering": ("scattering, /mm", 0.5, 15.0),
 }
-_COLORS = ("#c0392b", "#27853f", "#2c5aa0")
 
 
 class Panel:
@@ -52,8 +51,7 @@ class Panel:
         self.handles = handles = {"layer": gui.add_dropdown("layer", LAYERS)}
 
         def add(name: str, label: str, low: float, high: float, value: float, step: float = 0.01):
-            ends = min(low, value), max(high, value)
-            handles[name] = gui.add_slider(label, *ends, step, value)
+            handles[name] = gui.add_slider(label, min(low, value), max(high, value), step, value)
 
         for name, slider in _SLIDERS.items():
             add(name, *slider, getattr(start, name))
@@ -89,7 +87,7 @@ class Panel:
         )
         profiles, hidden = len(curves) - 1 - channels, {"points": {"show": False}}
         series = [
-            {"stroke": _COLORS[i % channels % 3] + opacity, "width": width, **hidden}
+            {"stroke": CHANNEL_COLORS[i % channels % 3] + opacity, "width": width, **hidden}
             for i in range(profiles + channels)
             for opacity, width in [("60", 6) if i < profiles else ("", 1.5)]
         ]

@@ -68,8 +68,7 @@ def weights_of(
     model: _fitting.AbstractModel, optics: Optics, variances: Float[Array, " gaussians"]
 ) -> SumOfGaussians:
     """Fit the weights to coefficients, for held variances."""
-    profile = model.profile(optics)
-    return _fitting.fit_weights(profile, variances, weights=_WEIGHTS, rule=model.rule)
+    return _fitting.fit_weights(model.profile(optics), variances, weights=_WEIGHTS, rule=model.rule)
 
 
 @eqx.filter_jit

@@ -81,6 +81,7 @@ def save(
         else:
             save_scene(paths[0], scene, camera, session.settings)
         with atomic_path(paths[1]) as temporary:
-            program = _PROGRAM.format(name=name, exposure=controls.exposure)
-            temporary.write_text(program, encoding="utf-8")
+            temporary.write_text(
+                _PROGRAM.format(name=name, exposure=controls.exposure), encoding="utf-8"
+            )
     return paths

@@ -74,13 +74,12 @@ class Search:
         try:
             with jax.enable_x64(True):
                 surface = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), material)
-                medium, model = surface.medium, self._session.model
                 recovery = recover(
                     self._observations,
                     splats,
-                    medium,
+                    surface.medium,
                     surface=surface,
-                    model=model,
+                    model=self._session.model,
                     progress=progress,
                 )
                 self._report(recovery.summary(), recovery.medium)

@@ -103,24 +103,27 @@ class Session:
                 "the material has single scattering, beside which less light enters as the "
                 "weights grow; fit it without --single-scattering"
             )
-        coefficients = () if medium is None else (medium.sigma_a, medium.sigma_s_prime)
-        absorption, scattering = map(_plain, coefficients or ((), ()))
-        eta, specular, roughness = (_rounded(getattr(material, name)) for name in SURFACE)
-        places = _plain(camera.position), _plain(target)
         self.start = Controls(
-            *(*places, absorption, scattering, eta, specular, roughness),
+            eye=_plain(camera.position),
+            target=_plain(target),
+            sigma_a=() if medium is None else _plain(medium.sigma_a),
+            sigma_s_prime=() if medium is None else _plain(medium.sigma_s_prime),
+            eta=_rounded(material.eta),
+            specular=_rounded(material.specular),
+            roughness=_rounded(material.roughness),
             skin=tuple((name, _rounded(getattr(skin, name))) for name in PIGMENTS if skin),
             light_stops=(0.0,) * len(scene.lights),
             exposure=exposure,
         )
         self.own, self.skin, self.settings = scene, skin, settings
-        self.model: _fitting.AbstractModel = _fitting.TransportModel()
-        if skin is not None:
-            self.model = _fitting.SkinModel(spectrum_to_rgb(skin.wavelengths))
+        self.model: _fitting.AbstractModel = (
+            _fitting.TransportModel()
+            if skin is None
+            else _fitting.SkinModel(spectrum_to_rgb(skin.wavelengths))
+        )
         self.fov = float(np.degrees(2 * np.arctan(0.5 / camera.focal_length)))
         few = jax.tree.map(lambda leaf: leaf[::_MERGED], scene.splats)
-        larger = {"radii": few.radii * _MERGED**0.5, "areas": few.areas * _MERGED}
-        few = dataclasses.replace(few, **larger)
+        few = dataclasses.replace(few, radii=few.radii * _MERGED**0.5, areas=few.areas * _MERGED)
         even = tuple(
             dataclasses.replace(light, directions=even_directions(_DIRECTIONS))
             if isinstance(light, EnvironmentLight) and light.directions is None
@@ -266,8 +269,7 @@ class Session:
         """Return what the light on the splats depends on, and what the view does besides."""
         state: Hashable = dataclasses.replace(controls, eye=(), target=(), layer="", exposure=0.0)
         if body.is_blended:
-            turned = controls.turn, controls.light_stops
-            state = *turned, controls.eta, controls.roughness
+            state = controls.turn, controls.light_stops, controls.eta, controls.roughness
         return (state, self._fits), (controls.eye, controls.target)
 
     def _plan(self, body: Body, controls: Controls) -> Plan:

@@ -6,10 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Key
 
-from splatjax._records import Numbers, as_floats, check_values
+from splatjax._records import Numbers, as_floats, check_values, is_traced
 from splatjax.scattering import Film, Layer, check_stack
 
 from ._results import MonteCarlo, assemble
@@ -82,7 +81,7 @@ class LayeredMedia(eqx.Module):
         Under `jit`, where values are unknown, each channel has its own walk.
         """
         geometry = (self.sigma_s, self.thickness, self.eta)
-        if any(isinstance(values, Tracer) for values in geometry):
+        if is_traced(geometry):
             return [np.asarray([channel]) for channel in range(self.sigma_a.shape[1])]
         sigma_s, thickness, eta = (np.asarray(values) for values in geometry)
         unit = 1 / sigma_s[self.first]
@@ -158,7 +157,8 @@ def monte_carlo(
         )
     edges = None if edges is None else as_floats(edges, dtype)
     media, edges = _prepare(layers, g, above, below, edges)
-    check_values("edges", edges, "at least two, from 0 mm on", lambda x: (x >= 0) & (len(x) > 1))
+    check_values("the number of edges", len(edges), "at least 2", lambda x: x > 1)
+    check_values("edges", edges, "at least 0 (mm)", lambda x: x >= 0)
     steps = jnp.diff(edges)
     check_values(
         "the steps of edges", steps, "positive (mm), with ascending edges", lambda x: x > 0

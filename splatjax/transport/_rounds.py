@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from splatjax._chunking import jit_unless_traced
+from splatjax._records import is_traced
 
 from ._results import Sum, photon_moments
 from ._walk import (
@@ -89,7 +89,7 @@ def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Sum:
     in between.
     """
     state = _start(walk)
-    if isinstance(state.started, Tracer):
+    if is_traced(state.started):
         return jax.lax.while_loop(
             lambda state: state.unfinished(walk), lambda state: _round(walk, state), state
         ).tally
