@@ -236,12 +236,15 @@ def relighting_basis(
 def _relighting_basis(
     scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, light: Transfer | None
 ) -> RelightingBasis:
-    template = scene.lights[0].coefficients
+    def coefficients(scene):
+        return scene.lights[0].coefficients
+
+    template = coefficients(scene)
     kept = transfer(scene, plan, settings) if light is None else light
 
     def under(harmonics: Float[Array, " harmonics"]):
         gray = jnp.broadcast_to(harmonics[:, None], template.shape)
-        lit = eqx.tree_at(lambda scene: scene.lights[0].coefficients, scene, gray)
+        lit = eqx.tree_at(coefficients, scene, gray)
         frame = render(lit, camera, settings, plan, light=kept)
         return frame.beauty, frame.coverage, frame.overflow
 

@@ -91,7 +91,7 @@ class Page:
         camera.fov = float(np.radians(session.fov))
         self._add_controls(server.gui)
         server.scene.on_click()(self._pick)
-        server.on_client_connect(lambda client: client.camera.on_update(self._look))
+        server.on_client_connect(self._join)
         server.on_client_disconnect(
             lambda client: self._joined.remove(client) if client in self._joined else None
         )
@@ -169,6 +169,9 @@ class Page:
 
     def _controls(self) -> Controls:
         return self._panel.controls(self._place)
+
+    def _join(self, client: Any) -> None:
+        client.camera.on_update(self._look)
 
     def _look(self, camera: Any) -> None:
         place, start = np.asarray([camera.position, camera.look_at]), self._session.start

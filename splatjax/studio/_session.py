@@ -228,7 +228,7 @@ class Session:
             return own
         if self.skin is not None:
             return dataclasses.replace(self.skin, eta=controls.eta, **dict(controls.skin))
-        rows = controls.sigma_a, controls.sigma_s_prime, [controls.eta] * own.channels
+        rows = controls.sigma_a, controls.sigma_s_prime, [controls.eta] * len(controls.sigma_a)
         return Medium(*(jnp.asarray(row, self._variances.dtype) for row in rows))
 
     def _fitted(self, controls: Controls) -> SumOfGaussians:
