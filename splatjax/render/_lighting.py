@@ -230,10 +230,10 @@ def irradiance_at_points(
     - `light`: the light, with the visibility at these points.
     - `normals`: unit.
     """
-    f0 = _shading.fresnel_f0(material.eta)
+    reflects = _shading.DirectionalAlbedo.of(_shading.fresnel_f0(material.eta), roughness)
 
     def enters(_, cosine):
-        fraction = 1 - _shading.directional_albedo(cosine, f0, roughness)
+        fraction = 1 - reflects(cosine)
         return fraction[None] * material.diffuse_fraction(cosine).T
 
     irradiance = _shading.sum_received(
@@ -301,10 +301,11 @@ def beams_at_splats(
     """
     splats, material = scene.splats, scene.material
     f0, roughness = _shading.fresnel_f0(material.eta), surface_parameters(scene)[1]
+    reflects = _shading.DirectionalAlbedo.of(f0, roughness)
 
     def along(axis: int):
         def enters(wi, cosine):
-            fraction = 1 - _shading.directional_albedo(cosine, f0, roughness)
+            fraction = 1 - reflects(cosine)
             sine = jnp.minimum((1 - cosine * cosine) / (material.eta * material.eta), 1 - _GRAZING)
             inward = jnp.sqrt(1 - sine) - cosine / material.eta
             inside = wi[:, axis] / material.eta + inward * splats.normals[:, axis]

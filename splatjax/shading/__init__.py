@@ -17,6 +17,7 @@ from ._deferred import (
 from ._specular import (
     average_albedo as average_albedo,
     directional_albedo as directional_albedo,
+    DirectionalAlbedo as DirectionalAlbedo,
     fresnel_f0 as fresnel_f0,
     specular_lobe as specular_lobe,
 )

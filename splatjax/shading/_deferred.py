@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from splatjax.scattering import AngularLaw, SingleScattering
 from splatjax.scene import StackedLights
 
-from ._specular import average_albedo, directional_albedo, specular_lobe
+from ._specular import DirectionalAlbedo, average_albedo, directional_albedo, specular_lobe
 
 _LEAST_SHARE = 1e-4
 
@@ -203,9 +203,10 @@ def single_scattered_radiance(
     over a mean free path.
     """
     to_eye = _cosine(points.normals, points.outgoing)
+    reflects = DirectionalAlbedo.of(f0, points.roughness)
 
     def scattered(_, cosine):
-        enters = 1 - directional_albedo(cosine, f0, points.roughness)
+        enters = 1 - reflects(cosine)
         return jnp.moveaxis(single.reflected(cosine, to_eye), -1, 0) * enters[None]
 
     return sum_received(

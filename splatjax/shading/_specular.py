@@ -4,6 +4,7 @@ and average albedo.
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -194,47 +195,71 @@ def _with_fresnel(tables: np.ndarray, f0: Float[Array, ""]) -> Float[Array, "...
     return f0 * constant + (grazing_reflectance(f0) - f0) * grazing
 
 
+class DirectionalAlbedo(eqx.Module):
+    r"""The fraction of light from one direction that a rough interface reflects, `rho(mu)`, by a
+    specular lobe of strength 1.
+
+    `rho = f0 a(mu, m) + (g - f0) b(mu, m)`, g the `grazing_reflectance`: Schlick's term splits the
+    integral of `specular_lobe` over the hemisphere into two tables, computed once by quadrature and
+    kept as Chebyshev series in `sqrt(mu)` and `log m`.
+
+    **Attributes:**
+
+    - `series`: coefficients over `sqrt(mu)` for the roughness of each point.
+
+    **Source:** the lobe of Kelemen and Szirmay-Kalos 2001, as normalized in `specular_lobe`.
+    """
+
+    series: Float[Array, "terms *#points"]
+
+    @classmethod
+    def of(
+        cls, f0: Float[Array, "..."], roughness: Float[Array, "*#points"]
+    ) -> "DirectionalAlbedo":
+        """Sum the series in `log m`.
+
+        **Arguments:**
+
+        - `f0`: reflectance at normal incidence. Differentiable.
+        - `roughness`: m, clamped to [0.05, 1] as in the lobe. Differentiable.
+        """
+        tables = _with_fresnel(_tables()[0], f0)
+        rows = map_chunks(
+            lambda part: (tables @ _roughness_basis(part)).T,
+            roughness.reshape(-1),
+            at_once=_AT_ONCE,
+        )
+        return cls(rows.T.reshape(-1, *roughness.shape))
+
+    def __call__(self, mu: Float[Array, "*points"]) -> Float[Array, "*points"]:
+        """Sum the series in `sqrt(mu)`.
+
+        **Arguments:**
+
+        - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the
+          slope at `mu = 0` diverges like `log mu` and is cut to 0 below 1e-5.
+
+        **Returns:** in [0, 1], within 2e-4 of the integral.
+        """
+        x = 2 * jnp.sqrt(jnp.clip(mu, _LEAST_MU, 1.0)) - 1
+        first, *others = self.series
+        following = after = jnp.zeros_like(x)
+        for row in reversed(others):  # Clenshaw's recurrence
+            following, after = row + 2 * x * following - after, following
+        return jnp.clip(first + x * following - after, 0.0, 1.0)
+
+
 def directional_albedo(
     mu: Float[Array, "..."],
     f0: Float[Array, "..."],
     roughness: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Compute the fraction of light from one direction that a rough interface reflects, `rho(mu)`,
-    by a specular lobe of strength 1.
-
-    `rho = f0 a(mu, m) + (g - f0) b(mu, m)`, g the `grazing_reflectance`: Schlick's term splits the
-    integral of
-    `specular_lobe` over the hemisphere into two tables, computed once by quadrature and kept as
-    Chebyshev series in `sqrt(mu)` and `log m`.
-
-    **Arguments:** scalars, or arrays that broadcast; a scalar `roughness` is cheapest.
-
-    - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the slope
-      at `mu = 0` diverges like `log mu` and is cut to 0 below 1e-5.
-    - `f0`: reflectance at normal incidence. Differentiable.
-    - `roughness`: m, clamped to [0.05, 1] as in the lobe. Differentiable.
-
-    **Returns:** in [0, 1], within 2e-4 of the integral.
-
-    **Source:** the lobe of Kelemen and Szirmay-Kalos 2001, as normalized in `specular_lobe`.
+    """Compute the `DirectionalAlbedo` of a rough interface for one direction; `mu` and `roughness`
+    broadcast.
     """
-    coefficients = _with_fresnel(_tables()[0], f0)
-
-    def over_mu(mu, along_mu):
-        x = 2 * jnp.sqrt(jnp.clip(mu, _LEAST_MU, 1.0)) - 1
-        return jnp.sum(_chebyshev_basis(x, _MU_NODES) * along_mu, axis=0)
-
-    if roughness.ndim == 0:
-        along_mu = (coefficients @ _roughness_basis(roughness))[:, None]
-        albedo = map_chunks(lambda mu: over_mu(mu, along_mu), mu.reshape(-1), at_once=_AT_ONCE)
-    else:
+    if roughness.ndim:
         mu, roughness = jnp.broadcast_arrays(mu, roughness)
-        albedo = map_chunks(
-            lambda mu, m: over_mu(mu, coefficients @ _roughness_basis(m)),
-            *(mu.reshape(-1), roughness.reshape(-1)),
-            at_once=_AT_ONCE,
-        )
-    return jnp.clip(albedo.reshape(mu.shape), 0.0, 1.0)
+    return DirectionalAlbedo.of(f0, roughness)(mu)
 
 
 def average_albedo(
