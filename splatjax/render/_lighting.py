@@ -230,7 +230,8 @@ def irradiance_at_points(
     - `light`: the light, with the visibility at these points.
     - `normals`: unit.
     """
-    reflects = _shading.DirectionalAlbedo.of(_shading.fresnel_f0(material.eta), roughness)
+    f0 = _shading.fresnel_f0(material.eta)
+    reflects = _shading.albedo_under(light.groups, f0, roughness)
 
     def enters(_, cosine):
         fraction = 1 - reflects(cosine)
@@ -301,7 +302,7 @@ def beams_at_splats(
     """
     splats, material = scene.splats, scene.material
     f0, roughness = _shading.fresnel_f0(material.eta), surface_parameters(scene)[1]
-    reflects = _shading.DirectionalAlbedo.of(f0, roughness)
+    reflects = _shading.albedo_under(light.groups, f0, roughness)
 
     def along(axis: int):
         def enters(wi, cosine):

@@ -5,6 +5,7 @@ interface.
 from splatjax._smooth import albedo_root as albedo_root
 
 from ._deferred import (
+    albedo_under as albedo_under,
     average_transmission as average_transmission,
     diffuse_transmission as diffuse_transmission,
     exit_transmission as exit_transmission,
@@ -17,7 +18,6 @@ from ._deferred import (
 from ._specular import (
     average_albedo as average_albedo,
     directional_albedo as directional_albedo,
-    DirectionalAlbedo as DirectionalAlbedo,
     fresnel_f0 as fresnel_f0,
     specular_lobe as specular_lobe,
 )

@@ -136,6 +136,17 @@ def sum_received(
     return total
 
 
+def albedo_under(
+    groups: list[StackedLights], f0: Float[Array, ""], roughness: Float[Array, "*points"]
+) -> Callable[[Float[Array, "*points"]], Float[Array, "*points"]]:
+    """Return `directional_albedo` as a function of the cosine, to be called for each light sample:
+    if there are many, the tables of the roughness are summed before.
+    """
+    if any(len(group.light_indices) > len(group.distinct) for group in groups):
+        return DirectionalAlbedo.of(f0, roughness)
+    return lambda mu: directional_albedo(mu, f0, roughness)
+
+
 def exit_transmission(
     points: SurfacePoints, f0: Float[Array, ""], angles: AngularLaw
 ) -> Float[Array, "channels *pixels"]:
@@ -203,7 +214,7 @@ def single_scattered_radiance(
     over a mean free path.
     """
     to_eye = _cosine(points.normals, points.outgoing)
-    reflects = DirectionalAlbedo.of(f0, points.roughness)
+    reflects = albedo_under(groups, f0, points.roughness)
 
     def scattered(_, cosine):
         enters = 1 - reflects(cosine)

@@ -257,9 +257,15 @@ def directional_albedo(
     """Compute the `DirectionalAlbedo` of a rough interface for one direction; `mu` and `roughness`
     broadcast.
     """
-    if roughness.ndim:
-        mu, roughness = jnp.broadcast_arrays(mu, roughness)
-    return DirectionalAlbedo.of(f0, roughness)(mu)
+    if not roughness.ndim:
+        return DirectionalAlbedo.of(f0, roughness)(mu)
+    mu, roughness = jnp.broadcast_arrays(mu, roughness)
+    flat = map_chunks(
+        lambda mu, m: DirectionalAlbedo.of(f0, m)(mu),
+        *(mu.reshape(-1), roughness.reshape(-1)),
+        at_once=_AT_ONCE,
+    )
+    return flat.reshape(mu.shape)
 
 
 def average_albedo(
