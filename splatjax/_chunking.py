@@ -19,6 +19,7 @@ Function = TypeVar("Function", bound=Callable)
 
 AT_ONCE = 1 << 16
 _LEAST_SPARE = 1.1
+_TRANSPOSED = 256  # points at a time: their rows stay in cache
 _LONGEST_DOUBLED = 1 << 19  # here both ways take as long to run
 
 
@@ -180,6 +181,22 @@ def needed_over_planned(needed: Int[Array, ""], planned: int) -> Float[Array, ""
     """
     ratio = needed.astype(jnp.float32) / planned
     return jnp.where(needed > planned, jnp.maximum(ratio, 1 + jnp.finfo(ratio.dtype).eps), ratio)
+
+
+def transposed(rows: Shaped[Array, "points rows"]) -> Shaped[Array, "rows points"]:
+    """Transpose rows block by block, so that the result is materialized: a compiler that fuses
+    would otherwise read the columns again for every reader.
+    """
+    count = len(rows)
+    size = min(count, _TRANSPOSED)
+
+    def add(i, out):
+        first = jnp.minimum(i * size, count - size)
+        block = jax.lax.dynamic_slice_in_dim(rows, first, size)
+        return jax.lax.dynamic_update_slice_in_dim(out, block.T, first, axis=1)
+
+    start = zeros_after(rows, rows.shape[::-1], rows.dtype)
+    return jax.lax.fori_loop(0, -(-count // size), add, start)
 
 
 def zeros_after(inputs: PyTree[Array], shape: tuple[int, ...], dtype: DTypeLike) -> Array:

@@ -206,8 +206,8 @@ def source_table(
     units = units_per_mm(variances)[layers][None, :, None]
     centers = below.centers.reshape(3, -1, SOURCES_PER_BLOCK) * units
     light = below.areas[None] * jnp.pad(below.irradiance, ((0, 1), (0, 0)), constant_values=1)
-    rows = light.reshape(len(light), -1, SOURCES_PER_BLOCK).swapaxes(0, 1)
-    return SourceTable(tuple(centers), rows, moments)
+    rows = light.reshape(len(light), -1, SOURCES_PER_BLOCK)
+    return SourceTable(tuple(centers), tuple(rows), moments)
 
 
 def per_flat_mass(

@@ -90,23 +90,24 @@ class LayerSources(eqx.Module):
         and energy are kept. Differentiable.
         """
 
-        def totals(rows: Float[Array, "#layers splats"]) -> Float[Array, " sources"]:
-            every = jnp.broadcast_to(rows, self.parents.shape)
-            return jax.ops.segment_sum(every.reshape(-1), self.parents.reshape(-1), self.count)
+        own_light = splats.irradiance.ndim == 3
 
-        areas = totals(splats.areas[None])
+        @jax.checkpoint
+        def add_layer(totals, layer):
+            parents, depth, light = layer
+            sunk = splats.centers - depth * splats.normals
+            light = light if own_light else splats.irradiance
+            rows = splats.areas, *(splats.areas * row for row in (*sunk, *light))
+            both = zip(totals, rows, strict=True)
+            return [total.at[parents].add(row, mode="drop") for total, row in both], None
+
+        # Layer by layer: a sum over all of them at once is computed from a copy of every row.
+        start = list(jnp.zeros((4 + len(splats.irradiance), self.count), splats.areas.dtype))
+        light = splats.irradiance.swapaxes(0, 1) if own_light else None
+        (areas, *rows), _ = jax.lax.scan(add_layer, start, (self.parents, depths, light))
         inverse = 1 / jnp.where(areas > 0, areas, 1.0)
-        sunk = splats.centers[:, None] - depths[None, :, None] * splats.normals[:, None]
-        return SunkSources(
-            centers=jnp.stack([totals(splats.areas[None] * row) * inverse for row in sunk]),
-            areas=areas,
-            irradiance=jnp.stack(
-                [
-                    totals(splats.areas[None] * jnp.atleast_2d(row)) * inverse
-                    for row in splats.irradiance
-                ]
-            ),
-        )
+        means = jnp.stack(rows) * inverse[None]
+        return SunkSources(centers=means[:3], areas=areas, irradiance=means[3:])
 
 
 def nested_cells(

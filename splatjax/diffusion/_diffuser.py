@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -250,8 +250,14 @@ def divide_by_mass(
     """Divide the light of each channel by the mass, which comes last; 0 where nothing is in
     reach.
     """
-    light, mass = sums[..., :-1, :], sums[..., -1:, :]
+    light, mass = _light_and_mass(sums, -2)
     return jnp.concatenate([light / jnp.where(mass > 0, mass, 1.0), mass], axis=-2)
+
+
+def _light_and_mass(rows: Float[Array, "..."], axis: int) -> Sequence[Float[Array, "..."]]:
+    """Separate the channels from the mass. The derivative of slices would be a sum."""
+    axis %= rows.ndim
+    return jax.lax.split(rows, (rows.shape[axis] - 1, 1), axis=axis)
 
 
 def layer_values(
@@ -269,16 +275,16 @@ def layer_values(
     - `per_mm`: from the unit of the places to that of the slopes.
     - `per_flat`: from the mass to that over a flat sheet's.
     """
-    total, first_moments = sums[..., 0, :], sums[..., 1:, :]
-    values = divide_by_mass(total)
+    total, first_moments = jax.lax.split(sums, (1, 3), axis=sums.ndim - 2)
     # grad N = sum w E (q - x) / v, and grad (N / D) = (grad N - (N / D) grad D) / D.
-    gradients = first_moments - total[..., None, :] * points[..., None, :, :]
-    mass, of_mass = total[..., -1:, :], gradients[..., -1:, :, :]
-    of_means = gradients[..., :-1, :, :] - values[..., :-1, None, :] * of_mass
-    of_means = of_means / jnp.where(mass > 0, mass, 1.0)[..., None, :]
+    of_light, of_mass = _light_and_mass(first_moments - total * points[..., None, :, :], -3)
+    light, mass = _light_and_mass(total[..., 0, :], -2)
+    inverse = 1 / jnp.where(mass > 0, mass, 1.0)
+    means = light * inverse
+    of_means = (of_light - means[..., None, :] * of_mass) * inverse[..., None, :]
     # A flat sheet has mass 1.
     row, slope = per_flat[..., None, :], per_mm[..., None, None, :]
     return LayerValues(
-        jnp.concatenate([values[..., :-1, :], row * values[..., -1:, :]], axis=-2),
+        jnp.concatenate([means, row * mass], axis=-2),
         slope * jnp.concatenate([of_means, row[..., None, :] * of_mass], axis=-3),
     )

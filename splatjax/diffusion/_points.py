@@ -69,11 +69,11 @@ def continue_to_points(
         )
 
     value, change = parts(blended)
-    # Row i is limited where row `limited_like[i]` is: derivatives like the light itself.
+    below, above = (value + change < 0) | (value < 0), change > value
     rows = value.shape[-2]
-    limited_like = np.append(np.arange(rows - 1) % channels, rows - 1)
-    is_below, is_above = (value + change < 0) | (value < 0), change > value
-    below, above = is_below[..., limited_like, :], is_above[..., limited_like, :]
+    if rows > channels + 1:  # derivatives of the source are limited where the light itself is
+        limited_like = np.append(np.arange(rows - 1) % channels, rows - 1)
+        below, above = below[..., limited_like, :], above[..., limited_like, :]
 
     def limited(value, change):
         return jnp.where(below, 0.0, jnp.where(above, 2 * value, value + change))

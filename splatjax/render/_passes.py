@@ -264,7 +264,8 @@ class Passes(eqx.Module):
 
         # A separate call, so that samples are materialized; large chunks, so that few are at once.
         def sample_and_read(sums, tiles) -> Result:
-            return map_places(shade_and_read, map_places(sample, sums, tiles))
+            samples = map_chunks(sample, sums, tiles, at_once=_splatting.TILES_AT_ONCE)
+            return map_places(shade_and_read, samples)
 
         at_once = 2 * _splatting.TILES_AT_ONCE
         values = map_chunks(sample_and_read, visible.sums, visible.tiles, at_once=at_once)
@@ -288,23 +289,22 @@ def sample_surfaces(
     - `sums`, `tiles`: those of `visible`, of these places.
     """
     surface = _splatting.Surface.of(sums, visible.view, visible.needed)
-    attributes = split_rows(in_a_row(surface.attributes), like)
-    positions = in_a_row(visible.points(tiles, surface.depth))
 
-    layers, derivative = jnp.zeros((0, 1, positions.shape[1]), positions.dtype), None
-    if attributes.layers is not None:
-        layers, derivative = _diffusion.continue_to_points(
-            attributes.layers,
-            attributes.derivative,
-            attributes.centers,
-            positions - origin,
-            len(attributes.source),
-        )
-    return SurfaceSamples(
-        attributes=dataclasses.replace(attributes, centers=None, layers=None, derivative=None),
-        positions=positions,
-        depth=in_a_row(surface.depth),
-        covered=in_a_row(surface.covered),
-        layers=layers,
-        derivative=derivative,
-    )
+    # Place by place, as the sums are in memory.
+    @jax.vmap
+    def of_place(rows, positions, depth, covered) -> SurfaceSamples:
+        attributes = split_rows(rows, like)
+        layers, derivative = jnp.zeros((0, 1, len(depth)), depth.dtype), None
+        if attributes.layers is not None:
+            layers, derivative = _diffusion.continue_to_points(
+                attributes.layers,
+                attributes.derivative,
+                attributes.centers,
+                positions - origin,
+                len(attributes.source),
+            )
+        attributes = dataclasses.replace(attributes, centers=None, layers=None, derivative=None)
+        return SurfaceSamples(attributes, positions, depth, covered, layers, derivative)
+
+    positions = visible.points(tiles, surface.depth)
+    return of_place(surface.attributes, positions, surface.depth, surface.covered)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax._chunking import map_chunks
 from splatjax._combination import PartByPart
 from splatjax._precision import full_precision
 from splatjax.scene import (
@@ -265,7 +266,8 @@ def _sample(
 ) -> tuple[_splatting.VisibleSurfaces, SurfaceSamples]:
     visible = _splatting.VisibleSurfaces.of(sums, view, settings.splatting, PartByPart())
     sample = partial(sample_surfaces, visible, like, origin[:, None])
-    return visible, map_places(sample, visible.sums, visible.tiles)
+    at_once = _splatting.TILES_AT_ONCE
+    return visible, map_chunks(sample, visible.sums, visible.tiles, at_once=at_once)
 
 
 @full_precision

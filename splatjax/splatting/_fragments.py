@@ -245,11 +245,11 @@ class Listed(eqx.Module):
         bins: Bins,
         shift: Float[Array, " splats"],
         numbers: tuple[Float[Array, " splats"], ...],
-        attributes: Float[Array, "splats attributes"],
+        attributes: Float[Array, "attributes splats"],
     ) -> "Listed":
         rows = jnp.stack([*numbers, shift], axis=1)
         empty = jnp.asarray([_EMPTY], rows.dtype)
-        return cls(bins, hidden_from, jnp.concatenate([rows, empty]), attributes)
+        return cls(bins, hidden_from, jnp.concatenate([rows, empty]), attributes.T)
 
 
 def _number_cotangents(splats, quad, near):

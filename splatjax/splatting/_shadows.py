@@ -261,7 +261,7 @@ def compute_visibility(
     **Returns:** in [0, 1]; 1 outside the map. Differentiable in the splats, the view and the map.
     """
     view = shadow_map.view
-    flat = shadow_map.planes.reshape(4, -1).T
+    flat = shadow_map.planes.reshape(4, -1)
 
     def land(centers, normals, radii):
         x, y, depth = view.project(centers.T)
@@ -281,7 +281,7 @@ def compute_visibility(
 def _compared(
     landed: tuple[Float[Array, " splats"], ...],
     view: AbstractView,
-    flat: Float[Array, "pixels 4"],
+    flat: Float[Array, "4 pixels"],
     settings: ShadowSettings,
 ) -> Float[Array, " splats"]:
     """Compare with depth and coverage of both surfaces of a map."""
@@ -307,8 +307,8 @@ def _compared(
         beyond = (expected - map_depth) / reach[None, None]
         return map_coverage * smooth_step(beyond - settings.bias, 0, settings.softness)
 
-    front_depth, front_coverage, behind_depth, behind_coverage = jnp.unstack(
-        flat.at[index].get(mode="promise_in_bounds"), axis=-1
+    front_depth, front_coverage, behind_depth, behind_coverage = (
+        plane.at[index].get(mode="promise_in_bounds") for plane in flat
     )
     behind = (1 - front_coverage) * hidden(behind_depth, behind_coverage)
     blocked = hidden(front_depth, front_coverage) + behind

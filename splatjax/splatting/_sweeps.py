@@ -20,6 +20,7 @@ from splatjax._chunking import (
     jit_unless_traced,
     list_chosen,
     needed_over_planned,
+    transposed,
     zeros_after,
 )
 from splatjax._combination import AbstractCombination
@@ -95,7 +96,7 @@ def sum_tile_fragments(
     bins: Bins,
     shift: Float[Array, " splats"],
     numbers: tuple[Float[Array, " splats"], ...],
-    attributes: Float[Array, "splats attributes"],
+    attributes: Float[Array, "attributes splats"],
 ) -> FragmentSums:
     """Sum attributes over the splats of every tile: this device's part of the sums."""
     listed = hidden_from, bins, shift, numbers, attributes
@@ -120,9 +121,8 @@ def _sum_bwd(sweep: Sweep, capacity: SurfaceCapacity, combination, residuals, co
     shape = len(listed.numbers), fields + attributes
     gradients = zeros_after(cotangent, shape, listed.numbers.dtype)
     rows = spans.far_limit, spans.near_limit, cotangent
-    gradients = part.each_round(spans.tiles, rows, add, gradients)[:-1]
-    of_numbers = tuple(jnp.moveaxis(gradients[:, :fields], 1, 0))
-    return None, None, None, of_numbers, gradients[:, fields:]
+    planes = transposed(part.each_round(spans.tiles, rows, add, gradients))[:, :-1]
+    return None, None, None, tuple(planes[:fields]), planes[fields:]
 
 
 sum_tile_fragments.defvjp(_sum_fwd, _sum_bwd)

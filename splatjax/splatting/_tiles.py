@@ -179,7 +179,7 @@ class TilePlan(AbstractRasterPlan):
             bin_items(footprints.ranges(grid), grid, self.bins),
             jax.lax.stop_gradient(footprints.shift),
             tuple(getattr(footprints, name) for name in NUMBERS),
-            attributes.T,
+            attributes,
         )
 
 
