@@ -118,7 +118,9 @@ class Targets(eqx.Module):
         lanes: Lanes,
         values: Float[Array, "lanes sums block"],
     ) -> Float[Array, "layers sums targets"]:
-        return sums.at[self._at(lanes)].set(jnp.swapaxes(values, 1, 2), mode="drop")
+        # Else the derivative searches for the last of several values of each point.
+        places = sums.at[self._at(lanes)]
+        return places.set(jnp.swapaxes(values, 1, 2), mode="drop", unique_indices=True)
 
     def read(
         self, sums: Float[Array, "layers sums targets"], lanes: Lanes

@@ -217,8 +217,9 @@ class EscapeNormalization(AbstractDiffusionKernel):
         # The curvature in the same unit, by the greatest mass of all layers not wider. Not by
         # `jnp.max`: its derivative asks whether recomputed floats are equal.
         greatest = jnp.ones_like(variance * mass)
-        for other in range(len(mass)):
-            its_variance, its_mass = variance[other][None], mass[other][None]
+        each = [1] * len(mass)
+        layers = zip(jax.lax.split(variance, each), jax.lax.split(mass, each), strict=True)
+        for its_variance, its_mass in layers:
             counts = (its_variance <= variance) & (its_mass > greatest)
             greatest = jnp.where(counts, its_mass, greatest)
         excess = greatest - 1
