@@ -19,7 +19,6 @@ Function = TypeVar("Function", bound=Callable)
 
 AT_ONCE = 1 << 16
 _LEAST_SPARE = 1.1
-_TRANSPOSED = 256  # points at a time: their rows stay in cache
 _LONGEST_DOUBLED = 1 << 19  # here both ways take as long to run
 
 
@@ -56,7 +55,7 @@ def map_chunks(function: Callable[..., Result], *arrays: PyTree, at_once: int = 
         return leaf.reshape(chunks, size, *leaf.shape[1:])
 
     def compute(chunk):
-        return jax.tree.map(_planes, function(*_vectors(chunk)))
+        return materialized(jax.tree.map(_planes, function(*_vectors(chunk))))
 
     results = jax.lax.map(
         jax.checkpoint(compute), jax.tree.map(split, jax.tree.map(_planes, arrays))
@@ -183,20 +182,18 @@ def needed_over_planned(needed: Int[Array, ""], planned: int) -> Float[Array, ""
     return jnp.where(needed > planned, jnp.maximum(ratio, 1 + jnp.finfo(ratio.dtype).eps), ratio)
 
 
-def transposed(rows: Shaped[Array, "points rows"]) -> Shaped[Array, "rows points"]:
-    """Transpose rows block by block, so that the result is materialized: a compiler that fuses
-    would otherwise read the columns again for every reader.
+@jax.custom_jvp
+def materialized(tree: PyTree[Array]) -> PyTree[Array]:
+    """Return arrays as they are, computed once and for all: a compiler cannot fuse what computes
+    them into their readers, which might compute it again, one number at a time, or on one thread.
     """
-    count = len(rows)
-    size = min(count, _TRANSPOSED)
+    never = _hidden_zero(tree)
+    return jax.lax.fori_loop(0, never, lambda _, kept: jax.tree.map(jnp.flip, kept), tree)
 
-    def add(i, out):
-        first = jnp.minimum(i * size, count - size)
-        block = jax.lax.dynamic_slice_in_dim(rows, first, size)
-        return jax.lax.dynamic_update_slice_in_dim(out, block.T, first, axis=1)
 
-    start = zeros_after(rows, rows.shape[::-1], rows.dtype)
-    return jax.lax.fori_loop(0, -(-count // size), add, start)
+@materialized.defjvp
+def _materialized_jvp(primals, tangents):
+    return materialized(*primals), tangents[0]
 
 
 def zeros_after(inputs: PyTree[Array], shape: tuple[int, ...], dtype: DTypeLike) -> Array:
@@ -211,10 +208,13 @@ def zeros_after(inputs: PyTree[Array], shape: tuple[int, ...], dtype: DTypeLike)
     - `inputs`: the last inputs of the loop to be computed; at least one element in all.
     - `shape`, `dtype`: of the zeros.
     """
-    first = [leaf.reshape(-1)[0] > 0 for leaf in jax.tree.leaves(inputs) if leaf.size]
-    # Always 0, which the compiler cannot infer.
-    zero = jnp.minimum(jnp.stack(first).astype(jnp.int32).sum(), 0)
-    return jnp.full(shape, zero.astype(dtype))
+    return jnp.full(shape, _hidden_zero(inputs).astype(dtype))
+
+
+def _hidden_zero(arrays: PyTree[Array]) -> Int[Array, ""]:
+    """Return 0, which the compiler cannot infer."""
+    first = [leaf.reshape(-1)[0] > 0 for leaf in jax.tree.leaves(arrays) if leaf.size]
+    return jnp.minimum(jnp.stack(first).astype(jnp.int32).sum(), 0)
 
 
 def jit_unless_traced(function: Function) -> Function:

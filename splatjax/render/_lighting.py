@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
+from splatjax._chunking import materialized
 from splatjax._combination import AbstractCombination
 from splatjax.scene import (
     AbstractLightSample,
@@ -174,7 +175,7 @@ def cast_shadows(
                     discs, view, splatting, plan.raster, combination, per_disc
                 )
                 visible = map_visibility(scene, shadow_map, plan.settings, plan.cube)
-                return visible, shadow_map.needed
+                return materialized(visible), shadow_map.needed
 
             views = shadow_views(light, bounds, plan.settings, plan.cube)
             stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)

@@ -19,8 +19,8 @@ from splatjax._chunking import (
     divided,
     jit_unless_traced,
     list_chosen,
+    materialized,
     needed_over_planned,
-    transposed,
     zeros_after,
 )
 from splatjax._combination import AbstractCombination
@@ -121,7 +121,7 @@ def _sum_bwd(sweep: Sweep, capacity: SurfaceCapacity, combination, residuals, co
     shape = len(listed.numbers), fields + attributes
     gradients = zeros_after(cotangent, shape, listed.numbers.dtype)
     rows = spans.far_limit, spans.near_limit, cotangent
-    planes = transposed(part.each_round(spans.tiles, rows, add, gradients))[:, :-1]
+    planes = materialized(part.each_round(spans.tiles, rows, add, gradients).T)[:, :-1]
     return None, None, None, tuple(planes[:fields]), planes[fields:]
 
 
