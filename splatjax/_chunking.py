@@ -55,7 +55,7 @@ def map_chunks(function: Callable[..., Result], *arrays: PyTree, at_once: int = 
         return leaf.reshape(chunks, size, *leaf.shape[1:])
 
     def compute(chunk):
-        return materialized(jax.tree.map(_planes, function(*_vectors(chunk))))
+        return jax.tree.map(_planes, function(*_vectors(chunk)))
 
     results = jax.lax.map(
         jax.checkpoint(compute), jax.tree.map(split, jax.tree.map(_planes, arrays))
