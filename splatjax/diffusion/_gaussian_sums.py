@@ -91,7 +91,8 @@ class Targets(eqx.Module):
 
     **Attributes:**
 
-    - `ranks`: index of every point among them, in any order; their number for all others.
+    - `ranks`: index of every point among them, in any order; for all others numbers beyond them, no
+      two equal.
     - `count`: their number. Static.
     """
 
@@ -104,7 +105,7 @@ class Targets(eqx.Module):
         every = jnp.arange(blocks * block, dtype=jnp.int32)
         if at is None:
             return cls(every.reshape(blocks, block), blocks * block)
-        ranks = jnp.full_like(every, len(at)).at[at].set(every[: len(at)], mode="drop")
+        ranks = (every + len(at)).at[at].set(every[: len(at)], mode="drop")
         return cls(ranks.reshape(blocks, block), len(at))
 
     def _at(self, lanes: Lanes) -> tuple:
@@ -118,7 +119,7 @@ class Targets(eqx.Module):
         lanes: Lanes,
         values: Float[Array, "lanes sums block"],
     ) -> Float[Array, "layers sums targets"]:
-        # Else the derivative searches for the last of several values of each point.
+        # No place is written twice; else the derivative searches for the last of several values.
         places = sums.at[self._at(lanes)]
         return places.set(jnp.swapaxes(values, 1, 2), mode="drop", unique_indices=True)
 

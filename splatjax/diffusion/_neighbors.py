@@ -51,7 +51,7 @@ class Lists(eqx.Module):
         """Apply `sweep(lanes, out)` to all lists with a row, `LANES` of them at a time."""
         count = len(self.order)
         lanes = min(LANES, count)
-        order = jnp.pad(self.order, (0, -count % lanes), constant_values=count)
+        order = jnp.append(self.order, jnp.arange(count, count + -count % lanes, dtype=jnp.int32))
         sweeps = (jnp.sum(self.counts > 0) + lanes - 1) // lanes
 
         def step(i, out):
@@ -66,7 +66,7 @@ class Lists(eqx.Module):
 
 
 class Lanes(eqx.Module):
-    """Lists that are swept together; the number of lists in a lane without one."""
+    """Lists that are swept together; in lanes without one different numbers beyond all lists."""
 
     lists: Int[Array, " lanes"]
     first: Int[Array, " lanes"]
