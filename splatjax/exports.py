@@ -1,5 +1,5 @@
 """Materials as parameters of other renderers: a sum of Gaussians as a single length, as kernels for
-screen space, and as plain numbers and text; a medium as the subsurface of OpenPBR.
+screen space, and as plain numbers and text; a material as the subsurface of OpenPBR and of glTF.
 """
 
 from typing import Any
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import HalfSpace, Medium, diffuse_scaling
+from splatjax.scene import Material
 
 
 def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
@@ -49,15 +50,35 @@ def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
     return 4 * jnp.pi * diffuse_scaling(gaussians.total_reflectance()) * burley_distance(gaussians)
 
 
-def openpbr_subsurface(medium: Medium) -> dict[str, Float[Array, ""] | Float[Array, " channels"]]:
-    r"""Compute the subsurface parameters of OpenPBR: the inverse of `HalfSpace.of_color`.
+def mean_free_path(material: Material) -> Float[Array, " channels"]:
+    r"""Compute the reduced mean free path of a material.
 
-    The color is the color of a flat surface whose index reflects light back into the body.
-    OpenPBR's own formula omits this reflection, and agrees to 0.6% for equal indices.
+    It is that of the material's coefficients if there are any. Otherwise it is `s(A) d`, with the
+    total reflectance A and the `d` of `burley_distance`, by which normalized diffusion is as wide
+    as the Gaussians.
+
+    **Returns:** mm.
+
+    **Source:** the curve `s` for diffuse transmission: Christensen and Burley 2015, Eq. 6.
+    """
+    if material.medium is not None:
+        return 1 / material.medium.sigma_t_prime
+    gaussians = material.gaussians
+    return diffuse_scaling(gaussians.total_reflectance()) * burley_distance(gaussians)
+
+
+def openpbr_subsurface(
+    material: Material,
+) -> dict[str, Float[Array, ""] | Float[Array, " channels"]]:
+    r"""Compute the subsurface parameters of OpenPBR.
+
+    With coefficients, it is the inverse of `HalfSpace.of_color`: the color of a flat surface whose
+    index reflects light back into the body. OpenPBR's own formula omits this reflection, and agrees
+    to 0.6% for equal indices. Without, the color is the total reflectance.
 
     **Arguments:**
 
-    - `medium`: Differentiable.
+    - `material`: Differentiable.
 
     **Returns:** `subsurface_color`, `subsurface_radius` (the largest mean free path, mm),
     `subsurface_radius_scale`, and `subsurface_scatter_anisotropy`, 0 since the coefficients are
@@ -65,15 +86,46 @@ def openpbr_subsurface(medium: Medium) -> dict[str, Float[Array, ""] | Float[Arr
 
     **Source:** Andersson et al. 2024, OpenPBR surface 1.1, "Subsurface".
     """
-    white = Medium(jnp.zeros_like(medium.sigma_a), medium.sigma_s_prime, medium.eta)
-    mean_free_path = 1 / medium.sigma_t_prime
-    radius = jnp.max(mean_free_path)
+    color, medium = material.total_reflectance(), material.medium
+    if medium is not None:
+        white = Medium(jnp.zeros_like(medium.sigma_a), medium.sigma_s_prime, medium.eta)
+        color = HalfSpace(medium).color() / HalfSpace(white).color()
+    lengths = mean_free_path(material)
+    radius = jnp.max(lengths)
     return {
-        "subsurface_color": HalfSpace(medium).color() / HalfSpace(white).color(),
+        "subsurface_color": color,
         "subsurface_radius": radius,
-        "subsurface_radius_scale": mean_free_path / radius,
+        "subsurface_radius_scale": lengths / radius,
         "subsurface_scatter_anisotropy": jnp.zeros_like(radius),
     }
+
+
+def gltf_volume(
+    material: Material,
+) -> tuple[Float[Array, ""], Float[Array, " channels"], Float[Array, " channels"]]:
+    r"""Compute the volume of a glTF material.
+
+    Light is attenuated by absorption and scattering. The multiple-scattering color of an albedo
+    `a` is `((p - s)^2 - u) / (v - 2 q (p - s))` with `s = sqrt(1 - a)`, the inverse of
+    `1 - (p + q c - sqrt(u + v c + q^2 c^2))^2`. Without coefficients it is the total reflectance.
+
+    **Arguments:**
+
+    - `material`: Differentiable.
+
+    **Returns:** the attenuation distance, mm, the attenuation color, and the multiple-scattering
+    color.
+
+    **Source:** Khronos, KHR_materials_volume and the draft of KHR_materials_volume_scatter; the
+    formula: Kulla and Conty 2017, "Revisiting Physically Based Shading at Imageworks".
+    """
+    color, medium, lengths = material.total_reflectance(), material.medium, mean_free_path(material)
+    if medium is not None:
+        p, q, u, v = 4.09712, 4.20863, 9.59217, 41.6808
+        rest = p - jnp.sqrt(1 - medium.sigma_s_prime / medium.sigma_t_prime)
+        color = (rest * rest - u) / (v - 2 * q * rest)
+    distance = jnp.min(lengths)
+    return distance, jnp.exp(-distance / lengths), color
 
 
 @jit_unless_traced

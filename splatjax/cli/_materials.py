@@ -14,6 +14,7 @@ import tyro
 import splatjax as sj
 
 from ._render import Render
+from ._scene import is_scene
 from ._terminal import (
     OptionalFloat,
     OptionalPath,
@@ -25,6 +26,11 @@ from ._terminal import (
     stage,
 )
 
+_SCENES = {
+    ".glb": sj.io.save_gltf,
+    ".usda": sj.io.save_usd,
+    ".usdc": sj.io.save_usd,
+}
 _ACROSS = 8  # pictures on a sheet
 _WHITE = 1.0  # radiance
 
@@ -77,26 +83,42 @@ class Materials:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a material for other renderers, as JSON or MaterialX.
+    """Write a material for other renderers as JSON or MaterialX, or a scene as glTF or USD.
 
-    JSON has its Gaussians, with formula, unit and source of each entry: GPU Gems weights, a kernel
-    for separable subsurface scattering, Burley's d, the shape parameter of Unity's HDRP, Blender's
-    radius. MaterialX has its coefficients, as an OpenPBR surface.
+    JSON has the Gaussians of a material, with formula, unit and source of each entry: GPU Gems
+    weights, a kernel for separable subsurface scattering, Burley's d, the shape parameter of
+    Unity's HDRP, Blender's radius. MaterialX has an OpenPBR surface. glTF and USD have material,
+    body, camera and lights. USD needs usd-core, the extra `usd` of splatjax.
 
-    Example: splatjax export marble --output marble.mtlx --mm-per-unit 10
+    Examples: splatjax export marble --output marble.mtlx --mm-per-unit 10
+              splatjax export scene.toml --output scene.glb
     """
 
-    #: Name of a material (`splatjax materials`), or path of a TOML file with a [fit].
-    material: tyro.conf.Positional[str]
-    #: JSON or MTLX file to write.
+    #: Name of a material (`splatjax materials`), or path of a TOML file with a [fit]; for glTF and
+    #: USD the TOML file of a scene, or a picture of `splatjax render`.
+    source: tyro.conf.Positional[str]
+    #: JSON, MTLX, GLB, USDA or USDC file to write.
     output: Path
     #: Length of the unit of the other renderer's scene, mm; for MaterialX.
     mm_per_unit: float = 1.0
 
     def run(self) -> None:
-        check_output(self.output, (".json", ".mtlx"))
+        check_output(self.output, (".json", ".mtlx", *_SCENES))
+        save = _SCENES.get(self.output.suffix.lower())
+        if save is not None:
+            if not is_scene(Path(self.source)):
+                raise ValueError(
+                    f"{self.output} is of a scene, and {self.source} is not; give the TOML file of "
+                    "a scene, or a picture of `splatjax render`"
+                )
+            with stage(f"loading {self.source}"):
+                scene, camera, _ = sj.io.load_scene(self.source)
+                mesh = sj.io.mesh_of_scene(sj.io.scene_table(self.source))
+            save(self.output, scene, camera, mesh=mesh)
+            print(self.output)
+            return
         with jax.enable_x64(True):
-            material = sj.load_material(self.material)
+            material = sj.load_material(self.source)
             if self.output.suffix.lower() == ".mtlx":
                 sj.io.save_materialx(self.output, material, mm_per_unit=self.mm_per_unit)
             else:

@@ -45,6 +45,7 @@ from ._cameras import (
     load_cameras as load_cameras,
     resized as resized,
 )
+from ._gltf import save_gltf as save_gltf
 from ._materialx import save_materialx as save_materialx
 from ._meshes import read_textured_mesh as read_textured_mesh, sample_mesh as sample_mesh
 from ._lights import (
@@ -59,6 +60,7 @@ from ._scenes import (
     DIFFUSERS as DIFFUSERS,
     load_scene as load_scene,
     material_of_scene as material_of_scene,
+    mesh_of_scene as mesh_of_scene,
     plain_scene as plain_scene,
     scene_table as scene_table,
     save_scene as save_scene,
@@ -68,3 +70,4 @@ from ._ply import (
     read_splats as read_splats,
     write_splats as write_splats,
 )
+from ._usd import save_usd as save_usd

@@ -28,7 +28,7 @@ from splatjax.scene import (
 )
 
 from ._cameras import gltf_nodes
-from ._files import StrPath, check_units, existing_file, naming, with_y_up
+from ._files import StrPath, atomic_path, check_units, existing_file, naming, with_y_up
 from ._images import read_picture
 from ._tables import Table, read_toml
 from ._trimesh import one_sentence
@@ -77,6 +77,14 @@ def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
         image = image.reshape(len(image) // 2, 2, image.shape[1] // 2, 2, -1).mean(axis=(1, 3))
     with naming(path):
         return EnvironmentLight(image.astype(np.float32), **fields)
+
+
+def write_image(path: StrPath, image: Any) -> None:
+    """Write the image of an environment to an EXR file, completely or not at all."""
+    import OpenImageIO as oiio  # 17 MB, so only where a picture is written
+
+    with atomic_path(path) as temporary:
+        oiio.ImageBuf(np.asarray(image, np.float32)).write(str(temporary))
 
 
 def load_lights(

@@ -9,7 +9,7 @@ import numpy as np
 from splatjax.exports import openpbr_subsurface, plain_numbers
 from splatjax.scene import Material
 
-from ._files import StrPath, atomic_path, check_units
+from ._files import StrPath, atomic_path, check_units, naming
 
 _SURFACE, _MATERIAL = "openpbr", "material"
 
@@ -17,38 +17,26 @@ _SURFACE, _MATERIAL = "openpbr", "material"
 def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.0) -> None:
     r"""Write a material as a MaterialX document with an OpenPBR surface, completely or not at all.
 
-    The color and the mean free path of the subsurface follow from the material's coefficients
-    (`splatjax.exports.openpbr_subsurface`). `specular_roughness` is the root of the material's
-    roughness. The Gaussians are not stored.
+    The color and the mean free path of the subsurface follow from the material's coefficients, or
+    from its Gaussians (`splatjax.exports.openpbr_subsurface`). `specular_roughness` is the root of
+    the material's roughness. The Gaussians are not stored.
 
     **Arguments:**
 
-    - `material`: a material of one or three channels, with a `Medium`.
+    - `material`: a material of one or three channels.
     - `mm_per_unit`: length of the unit of the other renderer's scene, mm.
 
-    **Raises:** `ValueError` for a material without coefficients, or of another number of channels;
-    `OSError` if the file cannot be written.
+    **Raises:** `ValueError` for a material of another number of channels; `OSError` if the file
+    cannot be written.
     """
     check_units(path, mm_per_unit)
-    medium = material.medium
-    if medium is None or medium.channels not in (1, 3):
-        raise ValueError(
-            f"{path}: OpenPBR needs a medium of 1 or 3 channels, and Material.medium is {medium}; "
-            "give coefficients, or export the Gaussians as JSON"
-        )
-    inputs = openpbr_subsurface(medium)
-    inputs["subsurface_radius"] /= mm_per_unit
-    inputs |= {
-        "subsurface_weight": jnp.ones(()),
-        "specular_weight": material.specular,
-        "specular_ior": jnp.mean(medium.eta),
-        "specular_roughness": jnp.sqrt(material.roughness),
-    }
+    with naming(path):
+        inputs = openpbr_inputs(material, mm_per_unit)
     root = ElementTree.Element("materialx", version="1.39", colorspace="lin_rec709")
     surface = ElementTree.SubElement(root, "open_pbr_surface", name=_SURFACE, type="surfaceshader")
-    for name, value in inputs.items():
-        kind, size = ("color3", 3) if jnp.ndim(value) else ("float", 1)
-        text = ", ".join(map(str, plain_numbers(np.broadcast_to(value, size))))
+    for name, values in inputs.items():
+        kind = "float" if len(values) == 1 else "color3"
+        text = ", ".join(map(str, values))
         ElementTree.SubElement(surface, "input", name=name, type=kind, value=text)
     shown = ElementTree.SubElement(root, "surfacematerial", name=_MATERIAL, type="material")
     ElementTree.SubElement(
@@ -57,3 +45,24 @@ def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.
     ElementTree.indent(root)
     with atomic_path(Path(path)) as temporary:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
+
+
+def openpbr_inputs(material: Material, mm_per_unit: float) -> dict[str, list[float]]:
+    """Return the inputs of an OpenPBR surface, one or three numbers each.
+
+    **Raises:** `ValueError` for a material of another number of channels.
+    """
+    if material.channels not in (1, 3):
+        raise ValueError(f"the material has {material.channels} channels; give one of 1 or 3")
+    inputs = openpbr_subsurface(material)
+    inputs["subsurface_radius"] /= mm_per_unit
+    inputs |= {
+        "subsurface_weight": jnp.ones(()),
+        "specular_weight": material.specular,
+        "specular_ior": material.eta,
+        "specular_roughness": jnp.sqrt(material.roughness),
+    }
+    sizes = {name: 3 if jnp.ndim(value) else 1 for name, value in inputs.items()}
+    return {
+        name: plain_numbers(np.broadcast_to(value, sizes[name])) for name, value in inputs.items()
+    }

@@ -3,24 +3,24 @@ picture is one, too.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import numpy as np
 
 from splatjax.diffusion import ClusterDiffuser, ExitanceDiffuser, ShapeDiffuser
 from splatjax.exports import plain_numbers
-from splatjax.geometry import bust
+from splatjax.geometry import Mesh, bust, bust_mesh
 from splatjax.render import RenderSettings
 from splatjax.scene import Camera, EnvironmentLight, Material, Scene, Splats
 
 from ._cameras import load_camera, resized
-from ._files import StrPath, atomic_path
+from ._files import StrPath
 from ._images import read_manifest
-from ._lights import LIGHT_ENTRIES, PLACE, light_of, look_at, plain_light
+from ._lights import LIGHT_ENTRIES, PLACE, light_of, look_at, plain_light, write_image
 from ._materials import MATERIAL_TABLES, load_material, plain_material, read_material
-from ._meshes import sample_mesh
+from ._meshes import read_textured_mesh, sample_mesh
 from ._ply import read_splats, write_splats
 from ._tables import Table, read_toml, write_toml
 
@@ -103,6 +103,19 @@ def material_of_scene(file: Table) -> StrPath | Table:
     return file.folder / name if Path(name).suffix else name
 
 
+def mesh_of_scene(file: Table) -> Mesh | None:
+    """Return the triangles, mm, of which the splats in a scene's file are samples, if any."""
+    table = file.table("splats", _BODY)
+    if "file" in table.entries:
+        return None
+    if "bust" in table.entries:
+        mesh = bust_mesh()
+    else:
+        path, unit = _body(table)
+        mesh, _ = read_textured_mesh(path, **unit)
+    return replace(mesh, vertices=table.number("scale", 1.0) * mesh.vertices)
+
+
 def save_scene(
     path: StrPath, scene: Scene, camera: Camera, settings: RenderSettings = RenderSettings()
 ) -> None:
@@ -114,8 +127,6 @@ def save_scene(
     **Raises:** `ValueError` for settings other than bounces and diffusion, and for lights that no
     file can store; `OSError` if a file cannot be written.
     """
-    import OpenImageIO as oiio  # 17 MB, so only where a picture is written
-
     path, lights = Path(path), []
     plain = RenderSettings(bounces=settings.bounces, diffuser=settings.diffuser)
     if not eqx.tree_equal(settings, plain) or settings.diffuser not in DIFFUSERS.values():
@@ -127,8 +138,7 @@ def save_scene(
         image = path.with_name(f"{path.stem}_{number}.exr")
         lights.append(plain_light(light, image.name))
         if isinstance(light, EnvironmentLight):
-            with atomic_path(image) as temporary:
-                oiio.ImageBuf(np.asarray(light.image, np.float32)).write(str(temporary))
+            write_image(image, light.image)
     write_splats(path.with_suffix(".ply"), scene.splats)
     splats = {"file": path.with_suffix(".ply").name}
     write_toml(path, plain_scene(splats, scene.material, camera, lights, settings))
@@ -162,17 +172,20 @@ def _splats(table: Table) -> Splats:
     if "bust" in table.entries:
         splats = bust(int(table.number("bust")))
     else:
+        count, (body, unit) = int(table.number("count", 200_000.0)), _body(table)
         is_mesh = "mesh" in table.entries
-        unit: dict[str, Any] = {
-            "mm_per_unit": table.number("mm_per_unit", None if is_mesh else 1.0),
-            "up": table.entries.get("up", "y"),
-        }
-        body = table.folder / table.text("mesh" if is_mesh else "file")
-        count = int(table.number("count", 200_000.0))
         splats = sample_mesh(body, count, **unit) if is_mesh else read_splats(body, **unit)
     scale, albedo = table.number("scale", 1.0), table.one_of("albedo", (True, False), True)
     splats = splats if scale == 1 else splats.scaled(scale)
     return splats if albedo else splats.without_maps()
+
+
+def _body(table: Table) -> tuple[Path, dict[str, Any]]:
+    """Return the file of a body, with its unit and upward axis."""
+    is_mesh = "mesh" in table.entries
+    unit = table.number("mm_per_unit", None if is_mesh else 1.0)
+    path = table.folder / table.text("mesh" if is_mesh else "file")
+    return path, {"mm_per_unit": unit, "up": table.entries.get("up", "y")}
 
 
 def _camera(table: Table) -> Camera:

@@ -53,6 +53,24 @@ def test_export_writes_what_other_renderers_take(tmp_path, capsys):
     np.testing.assert_allclose(sheet["gaussians"]["variances"], variances)
 
 
+def test_export_writes_a_scene_with_its_mesh(tmp_path):
+    """Which bounds the body: the mesh of the file in its unit, or that of the bust, scaled."""
+    trimesh.creation.box((1, 1, 9)).export(tmp_path / "box.stl")
+    camera = {"position": [0, 0, 620], "target": [0, 0, 0], "fov": 25}
+    for splats, height in (
+        ({"mesh": "box.stl", "mm_per_unit": 10, "up": "z", "scale": 2, "count": 50}, 0.18),
+        ({"bust": 50, "scale": 0.1}, 0.0327),
+    ):
+        scene = {"material": "skin", "splats": splats, "camera": camera}
+        lamp = {"kind": "directional", "direction": [0, -1, 0], "irradiance": 1.0}
+        sj.io.write_toml(tmp_path / "it.toml", scene | {"lights": [lamp]})
+        assert run("export", tmp_path / "it.toml", "--output", tmp_path / "it.glb") == 0
+        written = trimesh.load_mesh(tmp_path / "it.glb")
+        written.merge_vertices(merge_norm=True)
+        np.testing.assert_allclose(written.extents[1], height, rtol=2e-3)
+        assert written.is_watertight
+
+
 def test_sample_covers_a_mesh_that_may_have_z_up(tmp_path, capsys):
     """A box that is tall along z stands upright; its edges are hard up to an angle."""
     mesh, output = tmp_path / "box.stl", tmp_path / "box.ply"

@@ -76,6 +76,7 @@ REFUSED = {
     "render --output o.png": ["o.png", ".exr"],
     "fit skin1 --output o.txt": ["o.txt", ".toml"],
     "export skin --output o.txt": ["o.txt", ".json"],
+    "export skin --output o.glb": ["o.glb", "skin", "scene"],
     "turntable plate.ply --output none/turn": ["none/turn", "no folder"],
     "turntable plate.ply --output picture.png": ["picture.png", "is a file"],
     # Values that an option cannot have, before a file is read.

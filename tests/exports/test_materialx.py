@@ -50,8 +50,20 @@ def test_the_coefficients_come_back(tmp_path, float64):
     np.testing.assert_allclose(found["specular_roughness"], 0.5, rtol=1e-6)
 
 
-def test_a_material_of_gaussians_alone_is_refused(tmp_path):
-    material = sj.Material(sj.SumOfGaussians([1.0], [[0.5] * 3]))
-    with pytest.raises(ValueError, match=r"it.mtlx: .*medium.*None"):
-        save_materialx(tmp_path / "it.mtlx", material)
+def test_normalized_diffusion_stands_for_gaussians_alone(tmp_path, float64):
+    """Its albedo is theirs, and so is its mean distance: 2.5 d, where d is the path over `s(A)`."""
+    gaussians = sj.SumOfGaussians([1.0, 9.0], [[0.1, 0.3, 0.5], [0.2, 0.2, 0.4]])
+    save_materialx(tmp_path / "it.mtlx", sj.Material(gaussians))
+    found = read(tmp_path / "it.mtlx")
+    albedo = found["subsurface_color"]
+    np.testing.assert_allclose(albedo, [0.3, 0.5, 0.9], rtol=1e-6)
+    path = found["subsurface_radius"] * found["subsurface_radius_scale"]
+    distance = 2.5 * path / (1.9 - albedo + 3.5 * (albedo - 0.8) ** 2)
+    mean = np.sqrt(np.pi / 2 * gaussians.variances) @ gaussians.weights / albedo
+    np.testing.assert_allclose(distance, mean, rtol=1e-6)
+
+
+def test_two_channels_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"it.mtlx: .* 2 channels"):
+        save_materialx(tmp_path / "it.mtlx", sj.Material(sj.SumOfGaussians([1.0], [[0.5] * 2])))
     assert not list(tmp_path.iterdir())
