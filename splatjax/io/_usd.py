@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from splatjax.geometry import Mesh
 from splatjax.scene import (
@@ -71,24 +72,44 @@ def save_usd(path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None =
         stage.GetRootLayer().Export(str(temporary))
 
 
+def _define(
+    stage: Any,
+    name: str,
+    kind: str,
+    attributes: Mapping[str, Any],
+    pose: Float[np.ndarray, "4 4"] | None = None,
+) -> Any:
+    from pxr import Gf, UsdGeom
+
+    prim = stage.DefinePrim(f"/scene/{name}", kind)
+    for key, value in attributes.items():
+        prim.GetAttribute(key).Set(value)
+    if pose is not None:
+        UsdGeom.Xformable(prim).AddTransformOp().Set(Gf.Matrix4d(pose.T))
+    return prim
+
+
 def _body(stage: Any, body: Mesh) -> Any:
     from pxr import UsdGeom, Vt
 
-    def rows(values: np.ndarray | list[np.ndarray]) -> Any:
-        return Vt.Vec3fArray.FromNumpy(np.asarray(values, np.float32))
-
-    shape = UsdGeom.Mesh.Define(stage, "/scene/body")
-    shape.CreatePointsAttr(rows(body.vertices))
-    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(body.faces), 3, np.int32)))
-    faces = np.asarray(body.faces, np.int32).ravel()
-    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces))
-    shape.CreateExtentAttr(rows([body.vertices.min(axis=0), body.vertices.max(axis=0)]))
-    shape.CreateSubdivisionSchemeAttr("none")
-    shape.CreateNormalsAttr(rows(body.normals))
-    shape.SetNormalsInterpolation("vertex")
+    points, normals, extent = (
+        Vt.Vec3fArray.FromNumpy(np.asarray(rows, np.float32))
+        for rows in (body.vertices, body.normals, [body.vertices.min(0), body.vertices.max(0)])
+    )
+    faces = np.asarray(body.faces, np.int32)
+    attributes = {
+        "points": points,
+        "normals": normals,
+        "extent": extent,
+        "faceVertexCounts": Vt.IntArray(len(faces), 3),
+        "faceVertexIndices": Vt.IntArray.FromNumpy(faces.ravel()),
+        "subdivisionScheme": "none",
+    }
+    prim = _define(stage, "body", "Mesh", attributes)
     if body.colors is not None:
-        shape.CreateDisplayColorPrimvar("vertex").Set(rows(body.colors))
-    return shape.GetPrim()
+        colors = Vt.Vec3fArray.FromNumpy(np.asarray(body.colors, np.float32))
+        UsdGeom.Mesh(prim).CreateDisplayColorPrimvar("vertex").Set(colors)
+    return prim
 
 
 def _material(stage: Any, material: Material, has_albedo: bool) -> Any:
@@ -138,25 +159,23 @@ def _output(shader: Any, name: str, kind: str) -> Any:
 
 
 def _camera(stage: Any, camera: Camera) -> None:
-    from pxr import UsdGeom
-
-    lens = UsdGeom.Camera.Define(stage, "/scene/camera")
-    size = (
-        _FOCAL_LENGTH / float(camera.focal_length) * np.asarray([camera.width / camera.height, 1.0])
-    )
-    point = np.asarray(camera.principal_pixel, float) / [camera.width, camera.height]
-    offset = size * (0.5 - point) * [1, -1]
-    lens.CreateFocalLengthAttr(_FOCAL_LENGTH)
-    lens.CreateHorizontalApertureAttr(float(size[0]))
-    lens.CreateVerticalApertureAttr(float(size[1]))
-    lens.CreateHorizontalApertureOffsetAttr(float(offset[0]))
-    lens.CreateVerticalApertureOffsetAttr(float(offset[1]))
-    lens.CreateClippingRangeAttr((METERS * float(camera.near), _FARTHEST))
-    _place(lens, camera_pose(camera))
+    size = np.asarray([camera.width, camera.height])
+    point = np.asarray(camera.principal_pixel, float) / size
+    aperture = _FOCAL_LENGTH / float(camera.focal_length) * size / camera.height
+    offset = aperture * (0.5 - point) * [1, -1]
+    attributes = {
+        "focalLength": _FOCAL_LENGTH,
+        "horizontalAperture": aperture[0],
+        "verticalAperture": aperture[1],
+        "horizontalApertureOffset": offset[0],
+        "verticalApertureOffset": offset[1],
+        "clippingRange": (METERS * float(camera.near), _FARTHEST),
+    }
+    _define(stage, "camera", "Camera", attributes, camera_pose(camera))
 
 
 def _light(stage: Any, light: AbstractLight, number: int, path: Path) -> None:
-    from pxr import UsdGeom, UsdLux
+    from pxr import UsdLux
 
     greatest, color = strength(light)
     match light:
@@ -184,18 +203,11 @@ def _light(stage: Any, light: AbstractLight, number: int, path: Path) -> None:
                 stacklevel=3,
             )
             return
-    prim = stage.DefinePrim(f"/scene/light_{number}", kind)
-    shared: dict[str, Any] = {"intensity": greatest, "color": tuple(color)}
+    inputs = {f"inputs:{name}": value for name, value in inputs.items()}
+    inputs |= {"inputs:intensity": greatest, "inputs:color": tuple(color)}
+    prim = _define(stage, f"light_{number}", kind, inputs, light_pose(light))
     if isinstance(light, SpotLight):
         inner, outer = float(light.inner_angle), float(light.outer_angle)
-        UsdLux.ShapingAPI.Apply(prim)
-        shared |= {"shaping:cone:angle": outer, "shaping:cone:softness": 1 - inner / outer}
-    for name, value in (inputs | shared).items():
-        prim.GetAttribute(f"inputs:{name}").Set(value)
-    _place(UsdGeom.Xformable(prim), light_pose(light))
-
-
-def _place(of: Any, pose: np.ndarray) -> None:
-    from pxr import Gf
-
-    of.AddTransformOp().Set(Gf.Matrix4d(pose.T))
+        cone = UsdLux.ShapingAPI.Apply(prim)
+        cone.CreateShapingConeAngleAttr(outer)
+        cone.CreateShapingConeSoftnessAttr(1 - inner / outer)
