@@ -1,5 +1,6 @@
 """Surfaces of Gaussian-splatting scenes, whose ellipsoids become discs."""
 
+import importlib.util
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,21 @@ _TURNS = ("rot_1", "rot_2", "rot_3", "rot_0")  # the real part last
 GAUSSIAN_COLUMNS = {*_PLACES, *_COLORS, *_SCALES, *_TURNS, "opacity"}
 _HARMONIC = 0.5 / np.pi**0.5  # of degree 0
 _RADIUS = 2.0  # standard deviations: a disc of this radius has the variance of the Gaussian
+
+
+def spz_columns(path: Path) -> dict[str, np.ndarray]:
+    """Read the ellipsoids of an SPZ file by gsply, as the columns of a PLY file.
+
+    **Raises:** `ValueError` without gsply, or for a file that it cannot read.
+    """
+    if importlib.util.find_spec("gsply") is None:
+        raise ValueError(f"{path}: SPZ needs gsply; install it: pip install gsply")
+    import gsply
+
+    scene = gsply.read_spz(path)
+    names = *_PLACES, *_COLORS, *_SCALES, *_TURNS[-1:], *_TURNS[:-1], "opacity"
+    parts = scene.means, scene.sh0, scene.scales, scene.quats, scene.opacities
+    return dict(zip(names, np.column_stack(parts).T, strict=True))
 
 
 def surface_columns(

@@ -14,7 +14,7 @@ from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
 from ._files import StrPath, atomic_path, check_units, existing_file, naming, with_y_up
-from ._gaussian_scenes import GAUSSIAN_COLUMNS, surface_columns
+from ._gaussian_scenes import GAUSSIAN_COLUMNS, spz_columns, surface_columns
 from ._images import srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
@@ -75,9 +75,9 @@ def read_splats(
     Other properties and elements are ignored. A file with faces and without radii causes a warning,
     because a mesh should be sampled (`sample_mesh`).
 
-    The ellipsoids of a Gaussian-splatting scene (`f_dc_0`, `scale_0`, `rot_0`, ...) become discs:
-    the flattest axis is the normal, and the two others give the radius. A warning reports that
-    their colors contain the light of the scene.
+    The ellipsoids of a Gaussian-splatting scene (`f_dc_0`, `scale_0`, `rot_0`, ..., or an SPZ file,
+    which needs gsply) become discs: the flattest axis is the normal, and the two others give the
+    radius. A warning reports that their colors contain the light of the scene.
 
     **Arguments:**
 
@@ -95,8 +95,9 @@ def read_splats(
     if path.suffix[1:].lower() in set(FORMATS) - {"ply"}:
         raise ValueError(f"{path}: is a mesh; {_COVER.format(path)}")
     with one_sentence(path):
-        columns = load_with_trimesh(path, "ply")["columns"]
-        vertices = columns.get("vertex", {})
+        is_spz = path.suffix.lower() == ".spz"
+        columns = {} if is_spz else load_with_trimesh(path, "ply")["columns"]
+        vertices = spz_columns(path) if is_spz else columns.get("vertex", {})
         if vertices.keys() >= GAUSSIAN_COLUMNS:
             vertices = surface_columns(path, vertices, opacity)
         fields = _splat_fields(path, vertices, mm_per_unit, up)

@@ -6,8 +6,10 @@ time.
 import dataclasses
 import functools
 import shutil
+from importlib import util
 from pathlib import Path
 
+import gsply
 import jax
 import jax.numpy as jnp
 import meshio
@@ -294,3 +296,22 @@ def test_ellipsoids_of_a_gaussian_splatting_scene_become_discs(tmp_path):
         assert sj.read_splats(path, opacity=0.1).count == 120
     with pytest.raises(ValueError, match=r"no Gaussian has an opacity of 0\.9"):
         sj.read_splats(path, opacity=0.9)
+
+
+def test_a_compressed_gaussian_splatting_scene_is_that_of_its_ply_file(tmp_path, monkeypatch):
+    """To the 8 bits of its rotations and sizes."""
+    path = shutil.copy(Path(__file__).with_name("gaussians.ply"), tmp_path)
+    gsply.write_spz(tmp_path / "it.spz", gsply.plyread(path))
+    with pytest.warns(UserWarning, match="12 of 120 Gaussians"):
+        ball, found = (sj.read_splats(tmp_path / name) for name in ("gaussians.ply", "it.spz"))
+    _, nearest = KDTree(found.centers).query(ball.centers)
+    np.testing.assert_allclose(found.centers[nearest], ball.centers, atol=1e-3)
+    np.testing.assert_allclose(found.normals[nearest], ball.normals, atol=0.02)
+    np.testing.assert_allclose(found.radii[nearest], ball.radii, rtol=0.04)
+    np.testing.assert_allclose(found.albedo[nearest], ball.albedo, atol=0.02)
+    (tmp_path / "cut.spz").write_bytes((tmp_path / "it.spz").read_bytes()[:200])
+    with pytest.raises(ValueError, match=r"cut\.spz: cannot be read"):
+        sj.read_splats(tmp_path / "cut.spz")
+    monkeypatch.setattr(util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"it\.spz: .*gsply"):
+        sj.read_splats(tmp_path / "it.spz")
