@@ -5,7 +5,7 @@ import tomllib
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import tyro
@@ -17,7 +17,8 @@ from ._scene import check_alone, is_scene, scene_of_file, scene_of_options
 from ._terminal import OptionalPath, check_folder, stage
 from ._view import ViewOptions
 
-Opened: TypeAlias = tuple[sj.Scene, sj.Camera, sj.RenderSettings, sj.scattering.Skin | None, AsFile]
+# With the source of the material.
+Opened: TypeAlias = tuple[sj.Scene, sj.Camera, sj.RenderSettings, Any, AsFile]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,15 +63,23 @@ class Studio(ViewOptions):
         check_viser()
         observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
         if self.splats is not None and is_scene(self.splats):
-            scene, camera, settings, skin, as_file = self._of_file(self.splats)
+            scene, camera, settings, material, as_file = self._of_file(self.splats)
         else:
-            scene, camera, settings, skin, as_file = self._of_options()
+            scene, camera, settings, material, as_file = self._of_options()
         if observations:
             scene, camera = replace(scene, lights=observations[0].lights), observations[0].camera
         centers, forward = np.asarray(scene.splats.centers), camera.rotation[2]
         middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
         target = camera.position + (middle - camera.position) @ forward * forward
-        session = Session(scene, camera, target, settings, exposure=self.exposure, skin=skin)
+        session = Session(
+            scene,
+            camera,
+            target,
+            settings,
+            exposure=self.exposure,
+            skin=sj.io.load_skin(material),
+            g=sj.io.load_mean_cosine(material),
+        )
         return Page(
             session, self.output, as_file, observations=observations, host=self.host, port=self.port
         )
@@ -85,12 +94,12 @@ class Studio(ViewOptions):
                 i if i in sj.io.ENVIRONMENTS else str(self.pictures.parent / i) for i in images
             ]
         as_file = partial(scene_of_options, self, images, self.settings)
-        return scene, camera, self.settings, sj.io.load_skin(self.material), as_file
+        return scene, camera, self.settings, self.material, as_file
 
     def _of_file(self, path: Path) -> Opened:
         check_alone(self)
         with stage(f"loading {path}"):
             table = sj.io.scene_table(path)
             scene, camera, settings = sj.io.load_scene(path)
-        skin = sj.io.load_skin(sj.io.material_of_scene(table))
-        return scene, camera, settings, skin, partial(scene_of_file, table, settings)
+        material = sj.io.material_of_scene(table)
+        return scene, camera, settings, material, partial(scene_of_file, table, settings)

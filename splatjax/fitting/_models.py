@@ -86,10 +86,11 @@ class TransportModel(AbstractModel):
 
     **Attributes:**
 
-    - `g`: mean cosine of the phase function; one for all channels, or one for each. Static.
+    - `g`: mean cosine of the phase function; one for all channels, or one for each.
+      Differentiable; jitted functions are compiled for each Python number, and once for arrays.
     """
 
-    g: float | tuple[float, ...] = eqx.field(static=True, default=0.0)
+    g: float | tuple[float, ...] | Float[Array, "..."] = 0.0
 
     rule: ClassVar[AbstractRadialRule] = L2_QUADRATURE.beyond(0.5, tail=4.0)
     description: ClassVar[str | None] = "photon beam with the total of light transport"

@@ -153,12 +153,13 @@ def load_medium(name_or_path: StrPath) -> Medium:
     )
 
 
-def load_mean_cosine(name_or_path: StrPath) -> float:
-    r"""Load `g`, the mean cosine of a material's phase function: 0 if its file has none.
+def load_mean_cosine(material: StrPath | Table) -> float:
+    r"""Load `g`, the mean cosine of a material's phase function, or of the tables of one: 0 if it
+    has none.
 
     **Raises:** `ValueError` as `load_material` does.
     """
-    tables = _tables(name_or_path)
+    tables = material if isinstance(material, Table) else _tables(material)
     if not isinstance(_profile(tables), Dipole):
         return 0.0
     return tables.table("medium", MEDIUM_ENTRIES).number("g", 0.0)

@@ -6,7 +6,9 @@ from collections.abc import Hashable, Iterable
 import jax.numpy as jnp
 import numpy as np
 
-from splatjax.scene import AbstractLight, EnvironmentLight
+from splatjax._records import Numbers
+from splatjax.scattering import Skin
+from splatjax.scene import AbstractLight, Camera, EnvironmentLight, Scene
 
 LAYERS = ("beauty", "diffuse", "specular", "albedo", "irradiance", "shadow")
 SURFACE = ("eta", "specular", "roughness")
@@ -25,9 +27,11 @@ class Controls:
 
     - `eye`, `target`: of the camera, mm.
     - `sigma_a`, `sigma_s_prime`: per channel, 1/mm; empty for a material without a medium.
+    - `g`: mean cosine of the phase function of a medium.
     - `skin`: names and values of a `Skin`; empty without one.
     - `eta`, `specular`, `roughness`: as those of a `Material`; `eta` is the medium's too.
-    - `scale`: factor on the weights.
+    - `factors`: on the weights of each Gaussian.
+    - `scale`: factor on all weights.
     - `turn`: of the lights about the vertical axis, degrees.
     - `light_stops`: of each light, by which it is brighter; each doubles it.
     - `layer`: one of `LAYERS`.
@@ -41,16 +45,53 @@ class Controls:
     eta: float
     specular: float
     roughness: float
+    g: float = 0.0
     skin: tuple[tuple[str, float], ...] = ()
+    factors: tuple[float, ...] = ()
     scale: float = 1.0
     turn: float = 0.0
     light_stops: tuple[float, ...] = ()
     layer: str = "beauty"
     exposure: float = 0.0
 
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        camera: Camera,
+        target: Numbers,
+        exposure: float,
+        skin: Skin | None,
+        g: float,
+    ) -> "Controls":
+        """Return the state of a scene as it is."""
+        material, medium = scene.material, scene.material.medium if skin is None else None
+        return cls(
+            eye=plain(camera.position),
+            target=plain(target),
+            sigma_a=() if medium is None else plain(medium.sigma_a),
+            sigma_s_prime=() if medium is None else plain(medium.sigma_s_prime),
+            eta=_rounded(material.eta),
+            specular=_rounded(material.specular),
+            roughness=_rounded(material.roughness),
+            g=_rounded(g),
+            skin=tuple((name, _rounded(getattr(skin, name))) for name in PIGMENTS if skin),
+            factors=(1.0,) * len(material.gaussians.variances),
+            light_stops=(0.0,) * len(scene.lights),
+            exposure=exposure,
+        )
+
     @property
     def coefficients(self) -> Hashable:
-        return self.sigma_a, self.sigma_s_prime, self.skin, self.eta
+        return self.sigma_a, self.sigma_s_prime, self.g, self.skin, self.eta
+
+
+def plain(values: Numbers) -> tuple[float, ...]:
+    return tuple(np.asarray(values, np.float64).tolist())
+
+
+def _rounded(value: Numbers) -> float:
+    return round(float(np.asarray(value)), 6)
 
 
 def rotation_about_y(degrees: float) -> np.ndarray:

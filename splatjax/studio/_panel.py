@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from splatjax._format import CHANNEL_COLORS, channel_names, format_numbers
+from splatjax.diffusion import ShapeDiffuser
 from splatjax.scattering import Medium
 
 from ._controls import COEFFICIENTS, LAYERS, Controls
 from ._session import Session
 
 _MOST, _STOPS = 4.0, 8.0  # powers of 2, of coefficients and of light
+_LARGEST_G = 0.95
 _SLIDERS = {
     "turn": ("turn lights, °", -180.0, 180.0),
     "exposure": ("exposure, stops", -_STOPS, _STOPS),
@@ -53,8 +55,11 @@ class Panel:
         def add(name: str, label: str, low: float, high: float, value: float, step: float = 0.01):
             handles[name] = gui.add_slider(label, min(low, value), max(high, value), step, value)
 
+        # The diffusion equation knows no weights.
+        has_weights = not isinstance(session.settings.diffuser, ShapeDiffuser)
         for name, slider in _SLIDERS.items():
-            add(name, *slider, getattr(start, name))
+            if name != "scale" or has_weights:
+                add(name, *slider, getattr(start, name))
         lights = session.own.lights if len(start.light_stops) > 1 else ()
         for number, light in enumerate(lights):
             label = f"{type(light).__name__.removesuffix('Light').lower()} {number + 1}, stops"
@@ -68,6 +73,13 @@ class Panel:
             with gui.add_folder(f"{label}, by powers of 2", expand_by_default=False):
                 for number, name in enumerate(names):
                     add(f"{field} {number}", name, -_MOST, _MOST, 0.0)
+
+        if names:
+            add("g", "g, mean cosine", -_LARGEST_G, _LARGEST_G, start.g)
+        widths = np.sqrt(session.own.material.gaussians.variances).tolist() if has_weights else ()
+        with gui.add_folder("weights, by factors", expand_by_default=False, visible=has_weights):
+            for number, width in enumerate(widths):
+                add(f"factor {number}", f"{width:.2g} mm", 0.0, 2.0, 1.0)
 
         def moved(event: Any) -> None:
             handle = event.target
@@ -114,6 +126,8 @@ class Panel:
         changed["skin"] = tuple((name, values[f"skin {name}"]) for name, _ in start.skin)
         stops = tuple(value for name, value in values.items() if name.startswith("light "))
         changed["light_stops"] = stops or start.light_stops
+        factors = tuple(value for name, value in values.items() if name.startswith("factor "))
+        changed["factors"] = factors or start.factors
         return dataclasses.replace(start, eye=tuple(eye), target=tuple(target), **changed)
 
     def show(self, controls: Controls) -> None:

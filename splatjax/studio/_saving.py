@@ -57,7 +57,7 @@ def save(
     skin = optics if isinstance(optics, Skin) else None
     if as_file is not None:
         record = as_file(folder, scene.material, scene.lights, camera)
-        record["material"] = plain_material(scene.material, skin)
+        record["material"] = plain_material(scene.material, skin, g=controls.g)
     taken = {path.stem for path in folder.iterdir()}
     name = next(name for n in range(len(taken) + 1) if (name := f"studio_{n:03}") not in taken)
     paths = [folder / f"{name}{suffix}" for suffix in SUFFIXES[kind]]
@@ -74,7 +74,7 @@ def save(
         )
     elif kind == "material":
         source = {"provenance": "the studio of splatjax"}
-        save_material(scene.material, paths[0], profile=skin, source=source)
+        save_material(scene.material, paths[0], profile=skin, source=source, g=controls.g)
     else:
         if record:
             write_toml(paths[0], record)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 
+from splatjax.fitting import TransportModel
 from splatjax.inverse import Observation, recover
 from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
@@ -50,7 +51,8 @@ class Search:
         if not self._thread.is_alive():
             self._stopped.clear()
             material = self._session.scene(controls).material
-            self._thread = threading.Thread(target=self._run, args=[material], daemon=True)
+            inputs = material, TransportModel(controls.g)
+            self._thread = threading.Thread(target=self._run, args=inputs, daemon=True)
             self._thread.start()
 
     def stop(self) -> None:
@@ -62,7 +64,7 @@ class Search:
         if self._thread.is_alive():
             self._thread.join()
 
-    def _run(self, material: Material) -> None:
+    def _run(self, material: Material, model: TransportModel) -> None:
         def progress(stage: str, medium: Medium) -> None:
             if self._stopped.is_set():
                 raise _Stopped
@@ -79,7 +81,7 @@ class Search:
                     splats,
                     surface.medium,
                     surface=surface,
-                    model=self._session.model,
+                    model=model,
                     progress=progress,
                 )
                 self._report(recovery.summary(), recovery.medium)

@@ -40,6 +40,7 @@ from ._controls import (
     SURFACE,
     Controls,
     brightened,
+    plain,
     rotation_about_y,
     turned,
 )
@@ -79,6 +80,7 @@ class Session:
     - `target`: at which it looks, mm.
     - `settings`: of the pictures, such as bounces.
     - `skin`: from which the material was fitted; its pigments change instead of a medium.
+    - `g`: mean cosine of the phase function of the material's medium.
 
     **Attributes:**
 
@@ -96,31 +98,16 @@ class Session:
         *,
         exposure: float = 0.0,
         skin: Skin | None = None,
+        g: float = 0.0,
     ):
-        material, medium = scene.material, scene.material.medium if skin is None else None
+        material = scene.material
         if material.single_scattering is not None:
             raise ValueError(
                 "the material has single scattering, beside which less light enters as the "
                 "weights grow; fit it without --single-scattering"
             )
-        self.start = Controls(
-            eye=_plain(camera.position),
-            target=_plain(target),
-            sigma_a=() if medium is None else _plain(medium.sigma_a),
-            sigma_s_prime=() if medium is None else _plain(medium.sigma_s_prime),
-            eta=_rounded(material.eta),
-            specular=_rounded(material.specular),
-            roughness=_rounded(material.roughness),
-            skin=tuple((name, _rounded(getattr(skin, name))) for name in PIGMENTS if skin),
-            light_stops=(0.0,) * len(scene.lights),
-            exposure=exposure,
-        )
+        self.start = Controls.of(scene, camera, target, exposure, skin, g)
         self.own, self.skin, self.settings = scene, skin, settings
-        self.model: _fitting.AbstractModel = (
-            _fitting.TransportModel()
-            if skin is None
-            else _fitting.SkinModel(spectrum_to_rgb(skin.wavelengths))
-        )
         self.fov = float(np.degrees(2 * np.arctan(0.5 / camera.focal_length)))
         few = jax.tree.map(lambda leaf: leaf[::_MERGED], scene.splats)
         few = dataclasses.replace(few, radii=few.radii * _MERGED**0.5, areas=few.areas * _MERGED)
@@ -182,7 +169,7 @@ class Session:
         parts |= {f"{width:.2g} mm": of for width, of in zip(widths, light, strict=True)}
         if optics is not None:
             names = tuple(COEFFICIENTS) if isinstance(optics, Medium) else PIGMENTS[:2]
-            inputs = self.model, optics, names, self._variances, self._has_color
+            inputs = self.model(controls), optics, names, self._variances, self._has_color
             for name, of in zip(
                 names, changes_with_coefficients(*inputs, basis, place), strict=True
             ):
@@ -218,8 +205,14 @@ class Session:
         optics, gaussians = self.optics(controls), self._fitted(controls)
         widest = 3 * np.sqrt(np.max(self.own.material.gaussians.variances))
         radii = jnp.asarray(np.geomspace(0.01 * widest, widest, 120), self._variances.dtype)
-        rows = profile_curves(self.model, optics, gaussians, radii)
+        rows = profile_curves(self.model(controls), optics, gaussians, radii)
         return [np.asarray(row, np.float64) for row in (radii, *rows)]
+
+    def model(self, controls: Controls) -> _fitting.AbstractModel:
+        """Return the model by which the Gaussians of a state follow from its optics."""
+        if self.skin is not None:
+            return _fitting.SkinModel(spectrum_to_rgb(self.skin.wavelengths))
+        return _fitting.TransportModel(jnp.asarray(controls.g, self._variances.dtype))
 
     def optics(self, controls: Controls) -> Optics | None:
         """Return the medium or the skin of a state, if there is one."""
@@ -239,11 +232,14 @@ class Session:
             return gaussians
         key = controls.coefficients, self._fits
         if self._last_fit[0] != key:
-            self._last_fit = key, weights_of(self.model, optics, self._variances)
+            self._last_fit = key, weights_of(self.model(controls), optics, self._variances)
         return self._last_fit[1]
 
     def _gaussians(self, controls: Controls) -> SumOfGaussians:
+        """Return the Gaussians of a state; where splats have color, factors change only widths."""
         gaussians = self._fitted(controls)
+        factors = jnp.asarray(controls.factors, gaussians.weights.dtype)[:, None]
+        gaussians = SumOfGaussians(gaussians.variances, gaussians.weights * factors)
         gaussians = gaussians if self._has_color else gaussians.white()
         return SumOfGaussians(gaussians.variances, gaussians.weights * controls.scale)
 
@@ -256,10 +252,10 @@ class Session:
         if controls.coefficients == self._settled:
             return
         material, optics = self.own.material, self.optics(controls)
-        held, self._angles = self._variances, material.angles
-        self._variances = material.gaussians.variances
+        self._variances, self._angles = material.gaussians.variances, material.angles
         if optics is not None and optics is not self.optics(self.start):
-            self._variances, angles = variances_and_angles(self.model, optics, held)
+            inputs = self.model(controls), optics, self._variances
+            self._variances, angles = variances_and_angles(*inputs)
             self._angles = angles if self._has_color else None
         self._settled, self._fits = controls.coefficients, self._fits + 1
         if np.max(np.abs(np.log(self._variances / self._planned))) > np.log(_PLANNED):
@@ -279,14 +275,14 @@ class Session:
             start, scene = self.start, self.scene(controls, body)
             offset = np.subtract(start.eye, start.target)
             offsets = [d * rotation_about_y(t) @ offset for t in _QUARTERS for d in _DISTANCES]
-            eyes = [_plain(np.add(start.target, offset)) for offset in offsets]
+            eyes = [plain(np.add(start.target, offset)) for offset in offsets]
             states = [controls, *(dataclasses.replace(start, eye=eye) for eye in eyes)]
             turns = [0.0] if body.is_in_environments else _QUARTERS
             scenes = [dataclasses.replace(scene, lights=turned(scene.lights, t)) for t in turns]
             cameras = [self.camera(state, body) for state in states]
             return make_plan(scenes, cameras, body.settings)
 
-        return body.keep("plan", _plain(self._planned), make)
+        return body.keep("plan", plain(self._planned), make)
 
     def _light(self, body: Body, controls: Controls) -> SplatLight:
         plan, turn = self._plan(body, controls), None if body.keeps_shadows else controls.turn
@@ -320,11 +316,3 @@ class Session:
             values = shown.get(controls.layer, getattr(frame, controls.layer))
         image = to_display(np.asarray(values), controls.exposure)
         return np.broadcast_to(image, (*image.shape[:2], 3))
-
-
-def _plain(values: Numbers) -> tuple[float, ...]:
-    return tuple(np.asarray(values, np.float64).tolist())
-
-
-def _rounded(value: Numbers) -> float:
-    return round(float(np.asarray(value)), 6)

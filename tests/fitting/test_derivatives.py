@@ -275,6 +275,23 @@ def test_with_the_variances_of_a_fit_they_are_its_weights(float64):
     np.testing.assert_array_equal(found.variances, fitted.variances)
 
 
+def test_weights_follow_the_phase_function(float64):
+    """Against differences, of one mean cosine for all channels and of one for each."""
+    medium = sj.Medium([0.3, 1.0], [1.0, 0.7], 1.3)
+
+    @jax.jit
+    def fit(g):
+        model = sj.fitting.TransportModel(g)
+        profile = model.profile(medium)
+        return sj.fitting.fit_weights(profile, [0.1, 1.0, 9.0], weights=HELD, rule=model.rule)
+
+    for g in (jnp.asarray(0.7), jnp.asarray([0.7, -0.2])):
+        found = jax.jvp(fit, (g,), (jnp.ones_like(g),))[1].weights
+        moved = (fit(g + STEP).weights - fit(g - STEP).weights) / (2 * STEP)
+        assert np.min(np.abs(np.sum(moved, axis=0))) > 1e-4
+        np.testing.assert_allclose(found, moved, atol=1e-6)
+
+
 def test_wide_variances_serve_all_media_near(float64):
     near = sj.Medium([0.02, 0.2], [1.0, 0.7], 1.3)
     variances = sj.inverse.wide_variances(
