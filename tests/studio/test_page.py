@@ -119,8 +119,9 @@ def test_a_browser_picks_drags_orbits_and_saves(page, tmp_path):
         window.mouse.click(450, 200)
         wait_until(lambda: "| radiance |" in page._pixel.content)
         assert page._pixel.content.startswith("| pixel 24, 19 | red | green | blue |")
-        for folder in ("absorption", "scattering"):
-            window.get_by_text(f"{folder}, by powers of 2").click()
+        of_medium = (f"{name}, by powers of 2" for name in ("absorption", "scattering"))
+        for folder in (*of_medium, "weights, by factors"):
+            window.get_by_text(folder).click()
         sliders = window.get_by_role("slider")
         moving = {
             name: handle.value for name, handle in page._panel.handles.items() if name != "layer"
