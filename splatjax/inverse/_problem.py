@@ -213,7 +213,7 @@ class RecoveryProblem(eqx.Module):
             counted.append(observed.counted(picture.coverage.astype(dtype), background))
             is_lit = np.any(np.asarray(picture.pixel_radiance_per_exitance) > 0, axis=0)
             is_lit &= np.asarray(counted[-1]).reshape(-1)[np.asarray(picture.pixels)] > 0
-            kept.append(_with_points(picture, np.flatnonzero(is_lit), dtype))
+            kept.append(_as(dtype, picture.of_points(np.flatnonzero(is_lit))))
         check_counted(counted)
         return cls(tuple(kept), tuple(counted), tuple(evidence), unknowns, fit, loss, model)
 
@@ -240,16 +240,7 @@ class RecoveryProblem(eqx.Module):
         return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in residuals])
 
 
-def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) -> DiffusionBasis:
-    """Select some points of a picture, in the precision of a search."""
-    picture = eqx.tree_at(
-        lambda p: (
-            *jax.tree.leaves([getattr(p.light, name) for name in p.light.ALONG_POINTS]),
-            *(p.pixel_radiance_per_exitance, p.in_front, p.pixels),
-        ),
-        picture,
-        replace_fn=lambda leaf: leaf[..., kept],
-    )
+def _as(dtype: DTypeLike, picture: DiffusionBasis) -> DiffusionBasis:
     return jax.tree.map(
         lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, picture
     )

@@ -66,6 +66,17 @@ class DiffusionBasis(eqx.Module):
         diffuse = diffuse.at[:, self.pixels].add(radiance)
         return diffuse.T.reshape(height, width, channels) + self.specular
 
+    def of_points(self, chosen: Int[np.ndarray, " chosen"]) -> "DiffusionBasis":
+        """Return the part of some points. Most points of a new basis are in no pixel."""
+        return eqx.tree_at(
+            lambda basis: (
+                *jax.tree.leaves([getattr(basis.light, name) for name in basis.light.ALONG_POINTS]),
+                *(basis.pixel_radiance_per_exitance, basis.in_front, basis.pixels),
+            ),
+            self,
+            replace_fn=lambda leaf: leaf[..., chosen],
+        )
+
 
 def diffusion_basis(
     scene: Scene,

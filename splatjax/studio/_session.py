@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from splatjax import fitting as _fitting
+from splatjax._chunking import rounded_up
 from splatjax._display import to_display
 from splatjax._records import Numbers
 from splatjax.gaussians import SumOfGaussians
@@ -299,7 +300,11 @@ class Session:
         def make() -> DiffusionBasis:
             scene, camera = self.scene(controls, body, specular=1.0), self.camera(controls, body)
             plan, light = self._plan(body, controls), self._light(body, controls)
-            return diffusion_basis(scene, camera, plan=plan, light=light)
+            basis = diffusion_basis(scene, camera, plan=plan, light=light)
+            # Less than half of the points are seen, which is what a slider then waits for.
+            is_seen = np.any(np.asarray(basis.pixel_radiance_per_exitance) != 0, axis=0)
+            count = rounded_up(int(is_seen.sum()), 1, per_octave=2)
+            return basis.of_points(np.argsort(~is_seen, kind="stable")[:count])
 
         return body.keep("basis", self._keys(controls, body), lambda: body.planned(make))
 
