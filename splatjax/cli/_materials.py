@@ -21,6 +21,7 @@ from ._terminal import (
     UpAxis,
     check_output,
     note,
+    option_name,
     print_table,
     save_figure,
     stage,
@@ -28,6 +29,7 @@ from ._terminal import (
 
 _SCENES = {
     ".glb": sj.io.save_gltf,
+    ".usd": sj.io.save_usd,
     ".usda": sj.io.save_usd,
     ".usdc": sj.io.save_usd,
 }
@@ -97,14 +99,23 @@ class Export:
     #: Name of a material (`splatjax materials`), or path of a TOML file with a [fit]; for glTF and
     #: USD the TOML file of a scene, or a picture of `splatjax render`.
     source: tyro.conf.Positional[str]
-    #: JSON, MTLX, GLB, USDA or USDC file to write.
+    #: JSON, MTLX, GLB, USD, USDA or USDC file to write.
     output: Path
-    #: Length of the unit of the other renderer's scene, mm; for MaterialX.
+    #: Length of the unit of the other renderer's scene, mm; only for MaterialX.
     mm_per_unit: float = 1.0
+    #: Irradiance of 1 lux in the unit of the lights, only for glTF: 1/683, 0.00146, for Blender.
+    lux: float = 1.0
 
     def run(self) -> None:
         check_output(self.output, (".json", ".mtlx", *_SCENES))
-        save = _SCENES.get(self.output.suffix.lower())
+        suffix = self.output.suffix.lower()
+        for name, only in (("mm_per_unit", ".mtlx"), ("lux", ".glb")):
+            if getattr(self, name) != 1 and suffix != only:
+                raise ValueError(
+                    f"{option_name(name)} is {getattr(self, name)}, and {self.output} is no {only} "
+                    "file; leave the option out"
+                )
+        save = _SCENES.get(suffix)
         if save is not None:
             if not is_scene(Path(self.source)):
                 raise ValueError(
@@ -114,12 +125,18 @@ class Export:
             with stage(f"loading {self.source}"):
                 scene, camera, _ = sj.io.load_scene(self.source)
                 mesh = sj.io.mesh_of_scene(sj.io.scene_table(self.source))
-            save(self.output, scene, camera, mesh=mesh)
+            save(
+                self.output,
+                scene,
+                camera,
+                mesh=mesh,
+                **({"lux": self.lux} if suffix == ".glb" else {}),
+            )
             print(self.output)
             return
         with jax.enable_x64(True):
             material = sj.load_material(self.source)
-            if self.output.suffix.lower() == ".mtlx":
+            if suffix == ".mtlx":
                 sj.io.save_materialx(self.output, material, mm_per_unit=self.mm_per_unit)
             else:
                 sj.io.save_exports(material, self.output)

@@ -41,19 +41,22 @@ def scene_of_options(options: Any, images: str | list[str], *record: Any) -> dic
     """
     body = {"file": str(options.splats)} if options.splats else {"bust": options.count}
     body |= {"up": options.up, "scale": options.scale, "albedo": options.albedo}
-    return scene_in_folder(Path(), body, images, *record)
+    g = sj.io.load_mean_cosine(options.material)
+    return scene_in_folder(Path(), body, images, g, *record)
 
 
 def scene_of_file(table: Any, *record: Any) -> dict[str, Any]:
     """Return a scene as its file would be, from that of another; `record` as above."""
     images = [light.get("image", "") for light in table.entries["lights"]]
-    return scene_in_folder(table.folder, table.entries["splats"], images, *record)
+    g = sj.io.load_mean_cosine(sj.io.material_of_scene(table))
+    return scene_in_folder(table.folder, table.entries["splats"], images, g, *record)
 
 
 def scene_in_folder(
     old: Path,
     body: dict[str, Any],
     images: str | list[str],
+    g: float,
     settings: sj.RenderSettings,
     folder: Path,
     material: sj.Material,
@@ -61,7 +64,7 @@ def scene_in_folder(
     camera: sj.Camera,
 ) -> dict[str, Any]:
     """Return a scene as its file in a folder would be, with files named from an old folder: of the
-    body, and an image of each light, or one for all.
+    body, and an image of each light, or one for all; `g` is that of the material.
     """
 
     def moved(name: str) -> str:
@@ -72,4 +75,4 @@ def scene_in_folder(
     tables = [
         sj.io.plain_light(light, moved(image)) for light, image in zip(lights, images, strict=True)
     ]
-    return sj.io.plain_scene(body, material, camera, tables, settings)
+    return sj.io.plain_scene(body, material, camera, tables, settings, g)

@@ -318,7 +318,7 @@ class PictureOptions(ViewOptions):
             _note_once(
                 "unresolved, because they are narrower than the splats: Gaussians of standard "
                 f"deviations {', '.join(f'{w:.3g}' for w in widths)} mm; more splats resolve "
-                "them, or a smaller body (--scale)"
+                "them, or a smaller body (scale)"
             )
 
 

@@ -73,10 +73,14 @@ def save_gltf(
         )
     named = [light for light in scene.lights if type(light) in _KINDS]
     if len(named) < len(scene.lights):
-        kinds = sorted({type(light).__name__ for light in scene.lights} - {*map(_name, named)})
+        lost = ", ".join(
+            f"light {number} ({type(light).__name__})"
+            for number, light in enumerate(scene.lights, 1)
+            if type(light) not in _KINDS
+        )
         warnings.warn(
-            f"{path}: glTF has no {', '.join(kinds)}, and is written without them; write USD, or "
-            "give directional, point and spot lights",
+            f"{path}: glTF has no lights of this kind, and is written without {lost}; write USD, "
+            "or give directional, point and spot lights",
             stacklevel=2,
         )
 
@@ -159,7 +163,3 @@ def _light(light: AbstractLight, lux: float) -> dict[str, Any]:
 
 def _matrix(pose: np.ndarray) -> list[float]:
     return pose.T.ravel().tolist()  # column by column
-
-
-def _name(light: AbstractLight) -> str:
-    return type(light).__name__

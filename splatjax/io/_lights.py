@@ -241,6 +241,7 @@ def light_of(table: Table, channels: int) -> AbstractLight:
         values["count"] = int(table.number("count"))
     if kind == "environment":
         image = table.text("image")
+        image = image if Path(image).suffix else table.one_of("image", ENVIRONMENTS)
         values["image"] = (
             ENVIRONMENTS[image]()
             if image in ENVIRONMENTS

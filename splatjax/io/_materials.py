@@ -154,8 +154,7 @@ def load_medium(name_or_path: StrPath) -> Medium:
 
 
 def load_mean_cosine(material: StrPath | Table) -> float:
-    r"""Load `g`, the mean cosine of a material's phase function, or of the tables of one: 0 if it
-    has none.
+    r"""Load `g`, the mean cosine of a material's phase function, 0 if it has none.
 
     **Raises:** `ValueError` as `load_material` does.
     """
@@ -262,7 +261,9 @@ def plain_material(
 
 def _tables(name_or_path: StrPath) -> Table:
     path = material_path(name_or_path)
-    entries = read_toml(path, "check the path, or give a material (`list_materials()`)")
+    entries = read_toml(path, "check the path, or give a material (`splatjax materials`)")
+    if entries.keys() & {"splats", "camera", "material"}:
+        raise ValueError(f"{path}: is the file of a scene; give that of a material")
     return Table(path, "", entries, MATERIAL_TABLES)
 
 

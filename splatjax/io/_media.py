@@ -5,6 +5,9 @@ free path, or pigments.
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
+
+from splatjax._records import check_values
 from splatjax.exports import plain_numbers
 from splatjax.scattering import Film, HalfSpace, Layer, Medium, Skin
 
@@ -43,6 +46,8 @@ def medium_of(table: Table) -> Medium:
             "sigma_s_prime, or sigma_a, sigma_s and g, or color and mean_free_path"
         )
     eta, g = table.numbers("eta"), table.number("g", 0.0)
+    between = "between -1 and 1, both excluded"
+    table.make(check_values, "g", np.asarray(g), between, lambda x: abs(x) < 1)
     if "color" in names:
         table.one_of("unit", [THICKNESS_UNIT])
         color, mean_free_path = table.numbers("color"), table.numbers("mean_free_path")

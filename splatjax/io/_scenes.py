@@ -90,7 +90,13 @@ def scene_table(path: StrPath) -> Table:
         record = read_manifest(path)
     else:
         record = {"scene": read_toml(path, "give the file of a scene, or a picture")}
-    table = Table(path, "", record.get("scene"), _TABLES)
+    scene = record.get("scene")
+    if isinstance(scene, dict) and not scene.keys() & {*_TABLES}:
+        raise ValueError(
+            f"{path}: has no [splats], [camera] or [[lights]]; give the file of a scene, whose "
+            "`material` may be this one"
+        )
+    table = Table(path, "", scene, _TABLES)
     table.entries.setdefault("settings", {})
     return table
 
@@ -117,12 +123,18 @@ def mesh_of_scene(file: Table) -> Mesh | None:
 
 
 def save_scene(
-    path: StrPath, scene: Scene, camera: Camera, settings: RenderSettings = RenderSettings()
+    path: StrPath,
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings = RenderSettings(),
+    *,
+    g: float = 0.0,
 ) -> None:
     r"""Write a scene to a TOML file, its splats to a PLY file of the same name, and images of its
     environments to EXR files; `load_scene` reads them.
 
-    Numbers are restored exactly, but splats and environments are stored in single precision.
+    Numbers are restored exactly, but splats and environments are stored in single precision. `g` is
+    the mean cosine of the material's phase function.
 
     **Raises:** `ValueError` for settings other than bounces and diffusion, and for lights that no
     file can store; `OSError` if a file cannot be written.
@@ -141,7 +153,7 @@ def save_scene(
             write_image(image, light.image)
     write_splats(path.with_suffix(".ply"), scene.splats)
     splats = {"file": path.with_suffix(".ply").name}
-    write_toml(path, plain_scene(splats, scene.material, camera, lights, settings))
+    write_toml(path, plain_scene(splats, scene.material, camera, lights, settings, g))
 
 
 def plain_scene(
@@ -150,6 +162,7 @@ def plain_scene(
     camera: Camera,
     lights: Sequence[Mapping[str, Any]],
     settings: RenderSettings,
+    g: float = 0.0,
 ) -> dict[str, Any]:
     """Return the contents of a scene's file; [splats] and [[lights]] are given."""
     pose = {
@@ -160,7 +173,7 @@ def plain_scene(
     kinds = {type(diffuser): name for name, diffuser in DIFFUSERS.items()}
     diffusion = kinds.get(type(settings.diffuser), "clusters")
     return {
-        "material": plain_material(material),
+        "material": plain_material(material, g=g),
         "splats": dict(splats),
         "camera": pose | {name: getattr(camera, name) for name in (*_SIZE, "near")},
         "lights": list(lights),

@@ -108,7 +108,7 @@ class Table:
 
     def make(self, make: Callable[..., Made], *args: Any, **named: Any) -> Made:
         """Make a record from entries; its errors name the table."""
-        with naming(self.where):
+        with naming(self.where.rstrip(":")):
             return make(*args, **named)
 
 

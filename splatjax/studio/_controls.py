@@ -30,12 +30,14 @@ class Controls:
     - `g`: mean cosine of the phase function of a medium.
     - `skin`: names and values of a `Skin`; empty without one.
     - `eta`, `specular`, `roughness`: as those of a `Material`; `eta` is the medium's too.
-    - `factors`: on the weights of each Gaussian.
+    - `factors`: on the weights of each Gaussian, one for each.
     - `scale`: factor on all weights.
     - `turn`: of the lights about the vertical axis, degrees.
     - `light_stops`: of each light, by which it is brighter; each doubles it.
     - `layer`: one of `LAYERS`.
     - `exposure`: stops.
+
+    **Raises:** `ValueError` for a layer, a `g` or factors that cannot be.
     """
 
     eye: tuple[float, ...]
@@ -80,6 +82,20 @@ class Controls:
             light_stops=(0.0,) * len(scene.lights),
             exposure=exposure,
         )
+
+    def __post_init__(self):
+        if self.layer not in LAYERS:
+            raise ValueError(f"layer is {self.layer!r}; give {', '.join(LAYERS)}")
+        if not -1 < self.g < 1:
+            raise ValueError(f"g is {self.g}; it must be between -1 and 1, both excluded")
+        if min(self.scale, *self.factors, 0) < 0:
+            raise ValueError(
+                f"scale is {self.scale} and factors are {self.factors}; they must be at least 0"
+            )
+
+    @property
+    def has_fitted_weights(self) -> bool:
+        return {self.scale, *self.factors} == {1.0}
 
     @property
     def coefficients(self) -> Hashable:

@@ -54,7 +54,8 @@ def save(
     session.picture(controls)  # whose variances and angles are those of the coefficients
     scene, camera = session.scene(controls), session.camera(controls)
     optics, record = session.optics(controls), dict[str, Any]()
-    skin = optics if isinstance(optics, Skin) else None
+    skin = optics if isinstance(optics, Skin) and controls.has_fitted_weights else None
+    folder = Path(folder)
     if as_file is not None:
         record = as_file(folder, scene.material, scene.lights, camera)
         record["material"] = plain_material(scene.material, skin, g=controls.g)
@@ -79,7 +80,7 @@ def save(
         if record:
             write_toml(paths[0], record)
         else:
-            save_scene(paths[0], scene, camera, session.settings)
+            save_scene(paths[0], scene, camera, session.settings, g=controls.g)
         with atomic_path(paths[1]) as temporary:
             temporary.write_text(
                 _PROGRAM.format(name=name, exposure=controls.exposure), encoding="utf-8"

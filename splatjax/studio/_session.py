@@ -26,17 +26,12 @@ from splatjax.render import (
     transfer,
 )
 from splatjax.scattering import Medium, Skin
-from splatjax.scene import (
-    Camera,
-    EnvironmentLight,
-    Frame,
-    Scene,
-    even_directions,
-)
+from splatjax.scene import Camera, EnvironmentLight, Frame, Scene, even_directions
 
 from ._body import Body
 from ._controls import (
     COEFFICIENTS,
+    LAYERS,
     PIGMENTS,
     SURFACE,
     Controls,
@@ -56,7 +51,8 @@ from ._programs import (
 )
 
 _DIRECTIONS = 64  # of the shadows of an environment that turns
-_MERGED = 4  # splats of the body, for which one stands while it moves
+_MERGED = 6  # splats of the body, for which one stands while it moves
+_WIDER = 1.25  # than as many splats as even as those of the body, so that few holes open
 _PLANNED = 1.2  # by which variances may differ from those of a plan
 _QUARTERS = (0.0, 90.0, 180.0, 270.0)  # degrees
 _DISTANCES = (1.0, 0.5)  # that are planned for, over that of the first camera
@@ -70,7 +66,7 @@ class Session:
     Of each kind one result is kept: the visibility of the lights, the light on the splats, and the
     layers of the view (`splatjax.DiffusionBasis`). While coefficients move, the variances of the
     Gaussians are held, their weights are fitted, and the kept layers are blended. Where nothing is
-    kept for a state, `draft` shows a quarter of the splats in half the width and height. Drafts
+    kept for a state, `draft` shows a sixth of the splats in half the width and height. Drafts
     have the usual settings.
 
     **Arguments:**
@@ -111,7 +107,8 @@ class Session:
         self.own, self.skin, self.settings = scene, skin, settings
         self.fov = float(np.degrees(2 * np.arctan(0.5 / camera.focal_length)))
         few = jax.tree.map(lambda leaf: leaf[::_MERGED], scene.splats)
-        few = dataclasses.replace(few, radii=few.radii * _MERGED**0.5, areas=few.areas * _MERGED)
+        radii, areas = _WIDER * _MERGED**0.5 * few.radii, _MERGED * few.areas
+        few = dataclasses.replace(few, radii=radii, areas=areas)
         even = tuple(
             dataclasses.replace(light, directions=even_directions(_DIRECTIONS))
             if isinstance(light, EnvironmentLight) and light.directions is None
@@ -178,7 +175,9 @@ class Session:
         return {name: np.asarray(values, np.float64) for name, values in parts.items()}
 
     def scene(self, controls: Controls, body: Body | None = None, **surface: float) -> Scene:
-        """Return the scene of a state: after `picture`, that of the picture."""
+        """Return the scene of a state: after `picture`, that of the picture. Its material has no
+        medium if its weights are not those of one.
+        """
         surface = {name: getattr(controls, name) for name in SURFACE} | surface
         material = dataclasses.replace(
             self.own.material,
@@ -186,8 +185,10 @@ class Session:
             angles=self._angles,
             **surface,
         )
-        if isinstance(optics := self.optics(controls), Medium):
-            material = dataclasses.replace(material, medium=optics)
+        optics = self.optics(controls)
+        if isinstance(optics, Medium):
+            medium = optics if controls.has_fitted_weights else None
+            material = dataclasses.replace(material, medium=medium)
         body = body or self._full
         lights = brightened(turned(body.lights, controls.turn), controls.light_stops)
         return Scene(body.splats, lights, material)
@@ -264,7 +265,8 @@ class Session:
 
     def _keys(self, controls: Controls, body: Body) -> tuple[Hashable, Hashable]:
         """Return what the light on the splats depends on, and what the view does besides."""
-        state: Hashable = dataclasses.replace(controls, eye=(), target=(), layer="", exposure=0.0)
+        of_any_view = {"eye": (), "target": (), "layer": LAYERS[0], "exposure": 0.0}
+        state: Hashable = dataclasses.replace(controls, **of_any_view)
         if body.is_blended:
             state = controls.turn, controls.light_stops, controls.eta, controls.roughness
         return (state, self._fits), (controls.eye, controls.target)

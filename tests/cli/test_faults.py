@@ -77,6 +77,10 @@ REFUSED = {
     "fit skin1 --output o.txt": ["o.txt", ".toml"],
     "export skin --output o.txt": ["o.txt", ".json"],
     "export skin --output o.glb": ["o.glb", "skin", "scene"],
+    "export two.toml --output o.glb": ["two.toml", "the file of a scene"],
+    "export scene.toml --output o.mtlx": ["scene.toml", "is the file of a scene"],
+    "export skin --output o.json --mm-per-unit 9": ["--mm-per-unit is 9", "o.json", ".mtlx"],
+    "export scene.toml --output o.usda --lux 9": ["--lux is 9", "o.usda", ".glb"],
     "turntable plate.ply --output none/turn": ["none/turn", "no folder"],
     "turntable plate.ply --output picture.png": ["picture.png", "is a file"],
     # Values that an option cannot have, before a file is read.

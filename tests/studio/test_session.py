@@ -118,6 +118,23 @@ def test_a_state_depends_on_no_other_before(studio, states):
     assert eqx.tree_equal(studio.scene(controls).material.gaussians, before)
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"g": 1.0}, {"layer": "depth"}, {"scale": -0.1}, {"factors": (1.0, -1.0)}]
+)
+def test_a_state_that_cannot_be_is_refused(studio, wrong):
+    with pytest.raises(ValueError, match=rf"{next(iter(wrong))} (is|are)"):
+        with_(studio.start, **wrong)
+
+
+def test_a_material_is_saved_with_coefficients_only_if_they_give_its_weights(studio, tmp_path):
+    for changes, is_fitted in ({}, True), ({"scale": 0.5}, False):
+        controls = with_(studio.start, **changes)
+        (path,) = save(studio, controls, tmp_path, "material")
+        assert (sj.load_material(path).medium is not None) == is_fitted
+        total = studio.own.material.total_reflectance() * controls.scale
+        np.testing.assert_allclose(sj.load_material(path).total_reflectance(), total, rtol=1e-5)
+
+
 def test_factors_change_colors_or_only_widths_where_splats_have_color(studio):
     factors = (2.0, *[0.0] * (len(studio.start.factors) - 2), 1.0)
     controls = with_(studio.start, factors=factors)
