@@ -37,7 +37,11 @@ sj.write_png(here / "{name}.png", frame, exposure={exposure})
 
 
 def save(
-    session: Session, controls: Controls, folder: Path, kind: str, as_file: AsFile | None = None
+    session: Session,
+    controls: Controls,
+    folder: str | Path,
+    kind: str,
+    as_file: AsFile | None = None,
 ) -> list[Path]:
     """Write the picture (PNG), all its layers (EXR), the material, or the scene with the program
     that makes the picture; under the next number that is free.
