@@ -282,9 +282,7 @@ def single_scattering_at_splats(
     return _shading.single_scattered_radiance(points, light.groups, f0, single)
 
 
-def surface_parameters(
-    scene: Scene,
-) -> tuple[Float[Array, "*splats"], Float[Array, "*splats"]]:
+def surface_parameters(scene: Scene) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Multiply the material's specular strength and roughness with the splats' own."""
     material, splats = scene.material, scene.splats
     specular = material.specular if splats.specular is None else material.specular * splats.specular

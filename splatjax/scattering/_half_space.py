@@ -67,7 +67,9 @@ class AngularLaw(eqx.Module):
         return self.coefficients.shape[1]
 
     def projected(
-        self, total: Float[Array, " channels"], matrix: Float[Array, "channels colors"]
+        self,
+        total: Float[Array, " channels"],
+        matrix: Float[Array, "channels colors"] | Float[np.ndarray, "channels colors"],
     ) -> "AngularLaw":
         """Return the law for sums of channels, which are weighted by their total reflectance."""
         return AngularLaw((self.coefficients * total[None]) @ matrix / (total @ matrix)[None])
