@@ -321,5 +321,9 @@ def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
     for program in fences(page, "python"):
         exec(compile(_small(program), name(page), "exec"), names)
     for what, value in names.items():
-        for leaf in jax.tree.leaves(eqx.filter(value, eqx.is_inexact_array)):
-            assert not np.any(np.isnan(leaf)), what
+        for path, leaf in jax.tree_util.tree_leaves_with_path(
+            eqx.filter(value, eqx.is_inexact_array)
+        ):
+            # Pixels that do not count are NaN in these.
+            if not jax.tree_util.keystr(path).startswith((".pictures", ".residuals")):
+                assert not np.any(np.isnan(leaf)), what
