@@ -6,6 +6,7 @@ import abc
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, DTypeLike, Float
@@ -144,6 +145,8 @@ def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> lis
         name: DirectionalLight(direction=direction, irradiance=strength)
         for name, direction in directions.items()
     } | {"a laser dot in the middle": beam}
+    # In the precision of the body, whatever the default is.
+    lights = jax.tree.map(lambda leaf: leaf.astype(splats.centers.dtype), lights)
     return [Candidate(name, camera, light) for name, light in lights.items()]
 
 
