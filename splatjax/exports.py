@@ -63,8 +63,7 @@ def mean_free_path(material: Material) -> Float[Array, " channels"]:
     """
     if material.medium is not None:
         return 1 / material.medium.sigma_t_prime
-    gaussians = material.gaussians
-    return diffuse_scaling(gaussians.total_reflectance()) * burley_distance(gaussians)
+    return blender_radius(material.gaussians) / (4 * jnp.pi)
 
 
 def openpbr_subsurface(

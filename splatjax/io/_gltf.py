@@ -19,7 +19,8 @@ from splatjax.scene import (
 )
 
 from ._exchange import METERS, body_mesh, camera_pose, light_pose, strength
-from ._files import StrPath, atomic_path, check_suffix
+from ._files import StrPath, atomic_path, check_suffix, naming
+from ._materialx import check_colors
 
 _LIGHTS = "KHR_lights_punctual"
 _KINDS: dict[type[AbstractLight], str] = {
@@ -92,7 +93,7 @@ def save_gltf(
         lens = {"yfov": float(yfov), "aspectRatio": aspect, "znear": METERS * float(camera.near)}
         nodes = [{"name": "camera", "camera": 0, "matrix": _matrix(camera_pose(camera))}]
         for number, light in enumerate(named):
-            node = {"name": f"light {number}", "matrix": _matrix(light_pose(light))}
+            node = {"name": f"light {number + 1}", "matrix": _matrix(light_pose(light))}
             nodes.append(node | {"extensions": {_LIGHTS: {"light": number}}})
         first = len(tree["nodes"])
         tree["nodes"] += nodes
@@ -111,10 +112,8 @@ def save_gltf(
 
 
 def _material(path: StrPath, material: Material, has_albedo: bool, thickness: float) -> Any:
-    if material.channels not in (1, 3):
-        raise ValueError(
-            f"{path}: the material has {material.channels} channels; give one of 1 or 3"
-        )
+    with naming(path):
+        check_colors(material)
     distance, attenuation, scattered = map(np.asarray, gltf_volume(material))
     total = np.asarray(material.total_reflectance())
     color = np.ones(3) if has_albedo else np.broadcast_to(total, 3)

@@ -47,13 +47,18 @@ def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
 
 
+def check_colors(material: Material) -> None:
+    """Raise `ValueError` for a material that is neither gray nor in color."""
+    if material.channels not in (1, 3):
+        raise ValueError(f"the material has {material.channels} channels; give one of 1 or 3")
+
+
 def openpbr_inputs(material: Material, mm_per_unit: float) -> dict[str, list[float]]:
     """Return the inputs of an OpenPBR surface, one or three numbers each.
 
     **Raises:** `ValueError` for a material of another number of channels.
     """
-    if material.channels not in (1, 3):
-        raise ValueError(f"the material has {material.channels} channels; give one of 1 or 3")
+    check_colors(material)
     inputs = openpbr_subsurface(material)
     inputs["subsurface_radius"] /= mm_per_unit
     inputs |= {
