@@ -15,6 +15,7 @@ of a field stands in its metadata (`valid`); what concerns several is checked in
 """
 
 import dataclasses
+import importlib.util
 import inspect
 from collections.abc import Callable, Sequence
 from types import NoneType, UnionType
@@ -122,6 +123,13 @@ def check_class(name: str, value: Any, kind: type) -> None:
     """Raise `ValueError` for a value that is no record of a class."""
     if not isinstance(value, kind):
         raise ValueError(f"{name} must be {_call(kind)}; got {type(value).__name__}")
+
+
+def check_installed(use: str, module: str, package: str | None = None) -> None:
+    """Raise `ValueError` if an optional package is missing; the message names what needs it."""
+    if importlib.util.find_spec(module) is None:
+        package = package or module
+        raise ValueError(f"{use} needs {package}; install it: pip install {package}")
 
 
 def _call(cls: type) -> str:

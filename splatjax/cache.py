@@ -18,8 +18,9 @@ import pickle
 import platform
 import re
 import tempfile
-from collections.abc import Callable, Hashable
-from contextlib import ExitStack, suppress
+import threading
+from collections.abc import Callable, Generator, Hashable
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import NoneType
 from typing import Any, TypeVar, cast
@@ -40,7 +41,7 @@ Function = TypeVar("Function", bound=Callable)
 _LARGEST = 1 << 30  # bytes in the folder, beyond which what was not used for longest is deleted
 _EFFECTLESS = re.compile("cache|log|platform")  # settings of JAX that no result depends on
 # Events of JAX when its cache lacks a small program, and of this module before a picture's.
-COMPILING = "/jax/compilation_cache/cache_misses", "/splatjax/cache/compiling"
+_COMPILING = "/jax/compilation_cache/cache_misses", "/splatjax/cache/compiling"
 _LEAST_TIME = "jax_persistent_cache_min_compile_time_secs"
 # JAX's settings, unless its environment variables decide otherwise.
 _SETTINGS = {
@@ -53,6 +54,22 @@ _SETTINGS = {
 _folder: Path | None = None
 _programs: dict[Path, Callable] = {}
 _capacities: dict[Hashable, list[int]] = {}
+
+
+@contextmanager
+def watched_compiling(report: Callable[[], object]) -> Generator[None]:
+    """Call `report` whenever the current thread begins to compile a program."""
+    thread = threading.current_thread()
+
+    def listen(event: str, **_: Any) -> None:
+        if event in _COMPILING and threading.current_thread() is thread:
+            report()
+
+    jax.monitoring.register_event_listener(listen)
+    try:
+        yield
+    finally:
+        jax.monitoring.unregister_event_listener(listen)
 
 
 def keep(folder: str | os.PathLike[str] | None = None) -> Path:
@@ -163,7 +180,7 @@ def kept_jit(function: Function) -> Function:
 def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
     arrays, static = eqx.partition(arguments, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
-    jax.monitoring.record_event(COMPILING[1])
+    jax.monitoring.record_event(_COMPILING[1])
 
     # Of a list of arrays: a program that is loaded cannot make records of its arguments.
     def of_leaves(leaves):

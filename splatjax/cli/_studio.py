@@ -11,7 +11,8 @@ import numpy as np
 import tyro
 
 import splatjax as sj
-from splatjax.studio import AsFile, Page, Session, check_viser
+from splatjax._records import check_installed
+from splatjax.studio import AsFile, Page, Session
 
 from ._scene import check_alone, is_scene, scene_of_file, scene_of_options
 from ._terminal import OptionalPath, check_folder, stage
@@ -60,7 +61,7 @@ class Studio(ViewOptions):
 
     def page(self) -> Page:
         """Return the page of the scene, which is open."""
-        check_viser()
+        check_installed("the page of the studio", "viser")
         observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
         if self.splats is not None and is_scene(self.splats):
             scene, camera, settings, material, as_file = self._of_file(self.splats)

@@ -17,7 +17,7 @@ import tyro
 from jax.extend.backend import clear_backends
 from rich.console import Console
 
-from splatjax.cache import COMPILING
+from splatjax.cache import watched_compiling
 from splatjax.io import atomic_path, read_record, write_record
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
@@ -110,15 +110,8 @@ def preview(draw: Callable[[int], list]) -> Generator[None]:
       rows of red, green and blue up to 255.
     """
     pending = [draw]
-    jax.monitoring.register_event_listener(
-        listen := lambda event, **_: (
-            _show(pending.pop()) if pending and event in COMPILING else None
-        )
-    )
-    try:
+    with watched_compiling(lambda: _show(pending.pop()) if pending else None):
         yield
-    finally:
-        jax.monitoring.unregister_event_listener(listen)
 
 
 def _show(draw: Callable[[int], list]) -> None:

@@ -1,12 +1,12 @@
 """Surfaces of Gaussian-splatting scenes, whose ellipsoids become discs."""
 
-import importlib.util
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from splatjax._records import check_installed
 from splatjax.geometry import estimate_normals
 
 from ._images import srgb_to_linear
@@ -24,8 +24,7 @@ def spz_columns(path: Path) -> dict[str, np.ndarray]:
 
     **Raises:** `ValueError` without gsply, or for a file that it cannot read.
     """
-    if importlib.util.find_spec("gsply") is None:
-        raise ValueError(f"{path}: SPZ needs gsply; install it: pip install gsply")
+    check_installed(f"{path}: SPZ", "gsply")
     import gsply
 
     scene = gsply.read_spz(path)

@@ -35,7 +35,7 @@ def read_toml(path: Path, remedy: str) -> dict[str, Any]:
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is not a TOML file: {error}") from None
+        raise ValueError(f"{path}: is not a TOML file ({error}); {remedy}") from None
 
 
 class Table:

@@ -1,6 +1,5 @@
 """Scenes as USD, by usd-core."""
 
-import importlib.util
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from splatjax._records import check_installed
 from splatjax.geometry import Mesh
 from splatjax.scene import (
     AbstractLight,
@@ -53,8 +53,7 @@ def save_usd(path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None =
     path = Path(path)
     if path.suffix.lower() not in _SUFFIXES:
         raise ValueError(f"{path}: the name of this file must end in {' or '.join(_SUFFIXES)}")
-    if importlib.util.find_spec("pxr") is None:
-        raise ValueError(f"{path}: USD needs usd-core; install it: pip install usd-core")
+    check_installed(f"{path}: USD", "pxr", "usd-core")
     from pxr import Usd, UsdGeom, UsdShade
 
     stage = Usd.Stage.CreateInMemory()

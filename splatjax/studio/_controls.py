@@ -15,6 +15,7 @@ SURFACE = ("eta", "specular", "roughness")
 # What a medium and a skin are changed by, and derivatives are taken in.
 COEFFICIENTS = {"sigma_a": "absorption", "sigma_s_prime": "scattering"}
 PIGMENTS = ("melanin", "blood", "oxygenation", "eumelanin", "bilirubin", "thickness", "scattering")
+_HIGHEST = np.radians(89)  # of a camera, from which up is still up
 # Fields of lights that are points or directions.
 _VECTORS = ("direction", "position", "origin", "center", "edges")
 
@@ -114,6 +115,39 @@ def rotation_about_y(degrees: float) -> np.ndarray:
     """Return the rotation that turns +z towards +x."""
     turn = np.exp(1j * np.radians(degrees))
     return np.asarray([[turn.real, 0.0, turn.imag], [0.0, 1.0, 0.0], [-turn.imag, 0.0, turn.real]])
+
+
+def orbited(place: np.ndarray, turn: float, rise: float) -> np.ndarray:
+    """Move a camera around its target by degrees, about the y axis and upwards.
+
+    **Arguments:**
+
+    - `place`: the camera's position and its target.
+    """
+    offset = rotation_about_y(turn) @ (place[0] - place[1])
+    distance, level = np.linalg.norm(offset), np.linalg.norm(offset[[0, 2]])
+    latitude = np.arctan2(offset[1], level) + np.radians(rise)
+    latitude = np.clip(latitude, -_HIGHEST, _HIGHEST)
+    across = np.cos(latitude) / max(level, 1e-9 * distance)
+    offset = distance * np.asarray([across * offset[0], np.sin(latitude), across * offset[2]])
+    return np.asarray([place[1] + offset, place[1]])
+
+
+def zoomed(place: np.ndarray, log_factor: float) -> np.ndarray:
+    """Move a camera away from its target, by the logarithm of the factor."""
+    return np.asarray([place[1] + (place[0] - place[1]) * np.exp(log_factor), place[1]])
+
+
+def shifted(place: np.ndarray, across: float, down: float, fov: float) -> np.ndarray:
+    """Move a camera and its target so that the picture moves by fractions of its height.
+
+    **Arguments:**
+
+    - `fov`: vertical field of view, degrees.
+    """
+    right, below = np.asarray(Camera.look_at(*place).rotation)[:2]
+    height = 2 * np.linalg.norm(place[0] - place[1]) * np.tan(np.radians(fov / 2))
+    return place - height * (across * right + down * below)
 
 
 def turned(lights: Iterable[AbstractLight], degrees: float) -> tuple[AbstractLight, ...]:

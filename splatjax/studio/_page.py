@@ -3,20 +3,18 @@ which programs are also compiled, so that the page answers meanwhile.
 """
 
 import contextlib
-import importlib.util
 import io
 import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from PIL import Image, ImageOps
 
 from splatjax._display import to_display
-from splatjax._format import channel_names
-from splatjax.cache import COMPILING
+from splatjax._records import check_installed
+from splatjax.cache import watched_compiling
 from splatjax.inverse import Observation
 from splatjax.scattering import Medium
 
@@ -25,16 +23,18 @@ from ._panel import Panel
 from ._saving import SUFFIXES, AsFile, save
 from ._search import Search
 from ._session import Session
+from ._sliders import (
+    COMPILING,
+    STILL,
+    UNSEEN,
+    controls_of,
+    pixel_rows,
+    sentence_of,
+    values_of_medium,
+)
 
-_STILL = 0.15  # s without a change, after which the whole picture is computed
 _NEAR = 1e-5  # relative, of cameras that are the same
 _QUALITY = 92  # of JPEG
-
-
-def check_viser() -> None:
-    """Raise `ValueError` where viser is not installed."""
-    if importlib.util.find_spec("viser") is None:
-        raise ValueError("the page of the studio needs viser; install it: pip install viser")
 
 
 class Page:
@@ -67,7 +67,7 @@ class Page:
         host: str = "127.0.0.1",
         port: int = 8080,
     ):
-        check_viser()
+        check_installed("the page of the studio", "viser")
         import viser
 
         if folder.exists() and not folder.is_dir():
@@ -95,7 +95,6 @@ class Page:
         server.on_client_disconnect(
             lambda client: self._joined.remove(client) if client in self._joined else None
         )
-        jax.monitoring.register_event_listener(self._note_compiling)
         self._worker = threading.Thread(target=self._work, daemon=True)
         self._change()
         self._worker.start()
@@ -108,7 +107,6 @@ class Page:
         self._closed.set()
         self._change()
         self._worker.join()
-        jax.monitoring.unregister_event_listener(self._note_compiling)
         self._server.stop()
 
     def _add_controls(self, gui: Any) -> None:
@@ -145,7 +143,7 @@ class Page:
         """Show a stage of the search: sliders and picture become those of its medium."""
         self._stage.content = f"```\n{stage}\n```"
         if medium is not None:
-            self._panel.set_medium(medium)
+            self._panel.move(values_of_medium(self._session.start, medium))
 
     def _compare(self, picture: np.ndarray) -> None:
         """Show the first picture, and half the difference of another of the same camera to it."""
@@ -168,7 +166,7 @@ class Page:
         self._changed.set()
 
     def _controls(self) -> Controls:
-        return self._panel.controls(self._place)
+        return controls_of(self._session.start, self._panel.values, self._place)
 
     def _join(self, client: Any) -> None:
         client.camera.on_update(self._look)
@@ -202,12 +200,10 @@ class Page:
         """Tabulate the parts of the chosen pixel."""
         if self._picked is None:
             return "click the picture for the parts of a pixel"
-        parts = self._session.pixel(controls, *self._picked)
-        if not np.any(parts["radiance"]):
-            return "pixel {}, {} shows no surface".format(*self._picked)
-        names = channel_names(len(parts["radiance"]))
-        rows = [["pixel {}, {}".format(*self._picked), *names], ["---"] * (len(names) + 1)]
-        rows += [[name, *(f"{value:.3g}" for value in values)] for name, values in parts.items()]
+        titles, *rows = pixel_rows(self._session, controls, self._picked)
+        if not rows:
+            return titles[0]
+        rows = [titles, ["---"] * len(titles), *rows]
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
     def _send(self, client: Any) -> None:
@@ -223,27 +219,25 @@ class Page:
         for client in self._server.get_clients().values():
             self._send(client)
 
-    def _note_compiling(self, event: str, **_: Any) -> None:
-        if event in COMPILING and threading.current_thread() is self._worker:
-            self._status.content = "compiling, once for this and later starts ..."
+    def _note_compiling(self) -> None:
+        self._status.content = COMPILING
 
     def _work(self) -> None:
         while not self._closed.is_set():
             self._changed.wait()
             self._changed.clear()
             try:
-                self._status.content = self._update(self._controls())
-            except (OSError, ValueError) as error:
-                self._status.content = str(error)
+                with watched_compiling(self._note_compiling):
+                    self._status.content = self._update(self._controls())
             except Exception as error:
-                self._status.content = f"{type(error).__name__}: {error}"
+                self._status.content = sentence_of(error)
 
     def _update(self, controls: Controls) -> str:
         """Show a state, and write what is to be saved; return what to report."""
         session, written = self._session, list[Path]()
         self._show(session.draft(controls))
         self._panel.show(controls)
-        if not self._saves and self._changed.wait(_STILL):
+        if not self._saves and self._changed.wait(STILL):
             return ""
         picture = session.picture(controls)
         self._show(picture)
@@ -257,7 +251,7 @@ class Page:
         self._pixel.content = self._take_apart(controls)
         if written:
             return f"saved {', '.join(map(str, written))}"
-        return "" if picture.any() else "nothing is visible; the camera may be inside the body"
+        return "" if picture.any() else UNSEEN
 
 
 def _canvas(width: int, height: int, client: Any) -> tuple[int, int]:

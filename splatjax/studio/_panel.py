@@ -1,38 +1,15 @@
-"""The sliders beside the picture, and what they stand for."""
+"""The sliders of a page, by viser."""
 
-import dataclasses
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from typing import Any
 
-import numpy as np
+from splatjax._format import CHANNEL_COLORS
 
-from splatjax._format import CHANNEL_COLORS, channel_names, format_numbers
-from splatjax.diffusion import ShapeDiffuser
-from splatjax.scattering import Medium
-
-from ._controls import COEFFICIENTS, LAYERS, Controls
+from ._controls import LAYERS, Controls
 from ._session import Session
-
-_MOST, _STOPS = 4.0, 8.0  # powers of 2, of coefficients and of light
-_LARGEST_G = 0.95
-_SLIDERS = {
-    "turn": ("turn lights, °", -180.0, 180.0),
-    "exposure": ("exposure, stops", -_STOPS, _STOPS),
-    "scale": ("diffuse", 0.0, 1.0),
-    "specular": ("specular", 0.0, 1.0),
-    "roughness": ("roughness", 0.05, 1.0),
-    "eta": ("eta", 1.0, 2.5),
-}
-# Labels and ends of the pigments' sliders.
-_PIGMENTS = {
-    "melanin": ("melanin", 0.0, 0.5),
-    "blood": ("blood", 0.0, 0.1),
-    "oxygenation": ("oxygenation", 0.0, 1.0),
-    "eumelanin": ("eumelanin", 0.0, 1.0),
-    "bilirubin": ("bilirubin, g/l", 0.0, 0.3),
-    "thickness": ("epidermis, mm", 0.01, 0.5),
-    "scattering": ("scattering, /mm", 0.5, 15.0),
-}
+from ._sliders import coefficient_lines, sliders
 
 
 class Panel:
@@ -49,37 +26,13 @@ class Panel:
     """
 
     def __init__(self, gui: Any, session: Session, changed: Callable[[], None]):
-        self._session, start = session, session.start
+        self._session = session
         self.handles = handles = {"layer": gui.add_dropdown("layer", LAYERS)}
-
-        def add(name: str, label: str, low: float, high: float, value: float, step: float = 0.01):
-            handles[name] = gui.add_slider(label, min(low, value), max(high, value), step, value)
-
-        # The diffusion equation knows no weights.
-        has_weights = not isinstance(session.settings.diffuser, ShapeDiffuser)
-        for name, slider in _SLIDERS.items():
-            if name != "scale" or has_weights:
-                add(name, *slider, getattr(start, name))
-        lights = session.own.lights if len(start.light_stops) > 1 else ()
-        for number, light in enumerate(lights):
-            label = f"{type(light).__name__.removesuffix('Light').lower()} {number + 1}, stops"
-            add(f"light {number}", label, -_STOPS, _STOPS, 0.0)
-        if start.skin:
-            with gui.add_folder("skin"):
-                for name, value in start.skin:
-                    add(f"skin {name}", *_PIGMENTS[name], value, step=0.001)
-        names = ("all", *channel_names(session.own.material.channels)) if start.sigma_a else ()
-        for field, label in COEFFICIENTS.items() if names else ():
-            with gui.add_folder(f"{label}, by powers of 2", expand_by_default=False):
-                for number, name in enumerate(names):
-                    add(f"{field} {number}", name, -_MOST, _MOST, 0.0)
-
-        if names:
-            add("g", "g, mean cosine", -_LARGEST_G, _LARGEST_G, start.g)
-        widths = np.sqrt(session.own.material.gaussians.variances).tolist() if has_weights else ()
-        with gui.add_folder("weights, by factors", expand_by_default=False, visible=has_weights):
-            for number, width in enumerate(widths):
-                add(f"factor {number}", f"{width:.2g} mm", 0.0, 2.0, 1.0)
+        for folder, of_folder in itertools.groupby(sliders(session), lambda each: each.folder):
+            is_open = folder == "skin"
+            with gui.add_folder(folder, expand_by_default=is_open) if folder else nullcontext():
+                for name, label, low, high, value, _, step in of_folder:
+                    handles[name] = gui.add_slider(label, low, high, step, value)
 
         def moved(event: Any) -> None:
             handle = event.target
@@ -113,34 +66,16 @@ class Panel:
             aspect=1.8,
         )
 
-    def controls(self, place: np.ndarray) -> Controls:
-        """Return the state that the sliders and a camera's place and target give."""
-        values = {name: handle.value for name, handle in self.handles.items()}
-        start, (eye, target) = self._session.start, place.tolist()
-        changed = {name: value for name, value in values.items() if " " not in name}
-        for field in COEFFICIENTS:
-            changed[field] = tuple(
-                number * 2 ** (values[f"{field} 0"] + values[f"{field} {channel}"])
-                for channel, number in enumerate(getattr(start, field), 1)
-            )
-        changed["skin"] = tuple((name, values[f"skin {name}"]) for name, _ in start.skin)
-        stops = tuple(value for name, value in values.items() if name.startswith("light "))
-        changed["light_stops"] = stops or start.light_stops
-        factors = tuple(value for name, value in values.items() if name.startswith("factor "))
-        changed["factors"] = factors or start.factors
-        return dataclasses.replace(start, eye=tuple(eye), target=tuple(target), **changed)
+    @property
+    def values(self) -> dict[str, Any]:
+        return {name: handle.value for name, handle in self.handles.items()}
+
+    def move(self, values: Mapping[str, float]) -> None:
+        """Move sliders, by name."""
+        for name, value in values.items():
+            self.handles[name].value = value
 
     def show(self, controls: Controls) -> None:
         """Show the coefficients and the profile of a state."""
         self._plot.data = tuple(self._session.curves(controls))
-        rows = [(label, getattr(controls, field)) for field, label in COEFFICIENTS.items()]
-        shown = [f"{label}: {format_numbers(row, '.4g')} /mm" for label, row in rows if row]
-        self._numbers.content = "  \n".join(shown)
-
-    def set_medium(self, medium: Medium) -> None:
-        """Move the sliders to the coefficients of a medium."""
-        for field in COEFFICIENTS:
-            start = np.asarray(getattr(self._session.start, field))
-            powers = np.log2(np.asarray(getattr(medium, field)) / start)
-            for number, power in enumerate([0.0, *np.clip(powers, -_MOST, _MOST).tolist()]):
-                self.handles[f"{field} {number}"].value = power
+        self._numbers.content = "  \n".join(coefficient_lines(controls))

@@ -1,0 +1,126 @@
+"""What pages and widgets have in common: the sliders, what they stand for, and sentences."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from splatjax._format import channel_names, format_numbers
+from splatjax.diffusion import ShapeDiffuser
+from splatjax.scattering import Medium
+
+from ._controls import COEFFICIENTS, Controls
+from ._session import Session
+
+STILL = 0.15  # s without a change, after which the whole picture is computed
+COMPILING = "compiling, once for this and later starts ..."
+UNSEEN = "nothing is visible; the camera may be inside the body"
+_MOST, _STOPS = 4.0, 8.0  # powers of 2, of coefficients and of light
+_LARGEST_G = 0.95
+_GENERAL = {
+    "turn": ("turn lights, °", -180.0, 180.0),
+    "exposure": ("exposure, stops", -_STOPS, _STOPS),
+    "scale": ("diffuse", 0.0, 1.0),
+    "specular": ("specular", 0.0, 1.0),
+    "roughness": ("roughness", 0.05, 1.0),
+    "eta": ("eta", 1.0, 2.5),
+}
+# Labels and ends of the pigments' sliders.
+_PIGMENTS = {
+    "melanin": ("melanin", 0.0, 0.5),
+    "blood": ("blood", 0.0, 0.1),
+    "oxygenation": ("oxygenation", 0.0, 1.0),
+    "eumelanin": ("eumelanin", 0.0, 1.0),
+    "bilirubin": ("bilirubin, g/l", 0.0, 0.3),
+    "thickness": ("epidermis, mm", 0.01, 0.5),
+    "scattering": ("scattering, /mm", 0.5, 15.0),
+}
+
+
+class Slider(NamedTuple):
+    """One number of a state: its name, by which `controls_of` knows it, and what a page shows."""
+
+    name: str
+    label: str
+    low: float
+    high: float
+    value: float
+    folder: str = ""
+    step: float = 0.01
+
+
+def sliders(session: Session) -> list[Slider]:
+    """List the sliders of a session, those of a folder one after another."""
+    start, found = session.start, list[Slider]()
+
+    def add(name: str, label: str, low: float, high: float, value: float, *folder: Any) -> None:
+        found.append(Slider(name, label, min(low, value), max(high, value), value, *folder))
+
+    # The diffusion equation knows no weights.
+    has_weights = not isinstance(session.settings.diffuser, ShapeDiffuser)
+    for name, slider in _GENERAL.items():
+        if name != "scale" or has_weights:
+            add(name, *slider, getattr(start, name))
+    if start.sigma_a:
+        add("g", "g, mean cosine", -_LARGEST_G, _LARGEST_G, start.g)
+    for number, light in enumerate(session.own.lights if len(start.light_stops) > 1 else ()):
+        label = f"{type(light).__name__.removesuffix('Light').lower()} {number + 1}, stops"
+        add(f"light {number}", label, -_STOPS, _STOPS, 0.0)
+    for name, value in start.skin:
+        add(f"skin {name}", *_PIGMENTS[name], value, "skin", 0.001)
+    names = ("all", *channel_names(session.own.material.channels)) if start.sigma_a else ()
+    for field, label in COEFFICIENTS.items():
+        for number, name in enumerate(names):
+            add(f"{field} {number}", name, -_MOST, _MOST, 0.0, f"{label}, by powers of 2")
+    widths = np.sqrt(session.own.material.gaussians.variances).tolist() if has_weights else ()
+    for number, width in enumerate(widths):
+        add(f"factor {number}", f"{width:.2g} mm", 0.0, 2.0, 1.0, "weights, by factors")
+    return found
+
+
+def controls_of(start: Controls, values: Mapping[str, Any], place: np.ndarray) -> Controls:
+    """Return the state that the values of sliders, and a camera's place and target, give."""
+    eye, target = place.tolist()
+    changed = {name: value for name, value in values.items() if " " not in name}
+    for field in COEFFICIENTS:
+        changed[field] = tuple(
+            number * 2 ** (values[f"{field} 0"] + values[f"{field} {channel}"])
+            for channel, number in enumerate(getattr(start, field), 1)
+        )
+    changed["skin"] = tuple((name, values[f"skin {name}"]) for name, _ in start.skin)
+    for field, prefix in (("light_stops", "light "), ("factors", "factor ")):
+        of_field = tuple(value for name, value in values.items() if name.startswith(prefix))
+        changed[field] = of_field or getattr(start, field)
+    return dataclasses.replace(start, eye=tuple(eye), target=tuple(target), **changed)
+
+
+def values_of_medium(start: Controls, medium: Medium) -> dict[str, float]:
+    """Return where sliders stand for the coefficients of a medium, as far as they reach."""
+    values = dict[str, float]()
+    for field in COEFFICIENTS:
+        powers = np.log2(np.asarray(getattr(medium, field)) / np.asarray(getattr(start, field)))
+        for number, power in enumerate([0.0, *np.clip(powers, -_MOST, _MOST).tolist()]):
+            values[f"{field} {number}"] = power
+    return values
+
+
+def coefficient_lines(controls: Controls) -> list[str]:
+    """Format the coefficients of a state."""
+    rows = [(label, getattr(controls, field)) for field, label in COEFFICIENTS.items()]
+    return [f"{label}: {format_numbers(row, '.4g')} /mm" for label, row in rows if row]
+
+
+def sentence_of(error: Exception) -> str:
+    """Return what to show of an error."""
+    is_clear = isinstance(error, (OSError, ValueError))
+    return str(error) if is_clear else f"{type(error).__name__}: {error}"
+
+
+def pixel_rows(session: Session, controls: Controls, pixel: tuple[int, int]) -> list[list[str]]:
+    """Tabulate the parts of a pixel, below their titles; one cell if it shows no surface."""
+    parts, title = session.pixel(controls, *pixel), "pixel {}, {}".format(*pixel)
+    if not np.any(parts["radiance"]):
+        return [[f"{title} shows no surface"]]
+    rows = [[name, *(f"{value:.3g}" for value in values)] for name, values in parts.items()]
+    return [[title, *channel_names(len(parts["radiance"]))], *rows]
