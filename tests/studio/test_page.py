@@ -104,7 +104,7 @@ def test_a_browser_picks_drags_orbits_and_saves(page, tmp_path):
         browser = driver.chromium.launch(executable_path=chromium, args=flags)
         window = browser.new_page(viewport={"width": 900, "height": 500})
 
-        def shows_the_picture() -> None:
+        def shows_the_picture(window=window) -> None:
             wait_until(lambda: page._image.size == (SIDE, SIDE) and page._status.content == "")
             window.wait_for_timeout(3000)
             picture = Image.open(io.BytesIO(window.screenshot())).convert("RGB")
@@ -140,6 +140,11 @@ def test_a_browser_picks_drags_orbits_and_saves(page, tmp_path):
         window.mouse.move(260, 250, steps=5)
         window.mouse.up()
         wait_until(lambda: np.abs(page._place - start).max() > 5)
+        second = browser.new_page(viewport={"width": 900, "height": 500})
+        second.goto(page.url)
+        second.wait_for_selector("text=turn lights")
+        for each in (window, second):  # of one camera, which moved before the second came
+            shows_the_picture(each)
         window.get_by_role("button", name="PNG", exact=True).click()
         wait_until(lambda: [*tmp_path.rglob("studio_000.png")])
         browser.close()
