@@ -80,6 +80,7 @@ class Page:
         self._picked: tuple[int, int] | None = None
         self._image, self._joined = Image.new("RGB", (1, 1)), list[Any]()
         self._changed, self._closed = threading.Event(), threading.Event()
+        self._looking = threading.Lock()
         with contextlib.redirect_stdout(io.StringIO()):  # it prints an address of its own
             self._server = server = viser.ViserServer(host, port, "splatjax", verbose=False)
         # Viser would give the page a public address on a server of others.
@@ -169,7 +170,11 @@ class Page:
         return controls_of(self._session.start, self._panel.values, self._place)
 
     def _join(self, client: Any) -> None:
-        client.camera.on_update(self._look)
+        def look(camera: Any) -> None:
+            with self._looking:  # viser calls from several threads, perhaps for what is past
+                self._look(camera)
+
+        client.camera.on_update(look)
 
     def _look(self, camera: Any) -> None:
         place, start = np.asarray([camera.position, camera.look_at]), self._session.start
