@@ -73,7 +73,7 @@ class DipoleStarts(eqx.Module):
 
     In units of squared mean free paths the variances depend only on these two. They are tabulated
     at steps of `sqrt(1 - alpha')`, of which they are smooth functions, and interpolated linearly in
-    their logarithms; beyond the table's ends the last entry serves.
+    their logarithms; outside of the table the nearest entry is used.
 
     **Attributes:**
 

@@ -34,8 +34,8 @@ from ._problem import make_plans
 
 
 class Evaluation(eqx.Module):
-    """A rendered picture and its loss: the sum over its values, and the gradient in the coordinates
-    of the picture.
+    """A rendered picture, the sum of the losses of its values, and the gradient of this sum with
+    respect to the coordinates of the picture.
     """
 
     loss: Float[Array, ""]

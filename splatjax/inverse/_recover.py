@@ -80,7 +80,8 @@ def recover(
     Give a start within a factor of three of both coefficients, or several starts. The error bars
     assume that shape, lights, camera and model are right; compare `recovery.chi_squared` with 1.
 
-    The search is weighted least squares on all pixels at once, through the whole graph. The layers,
+    The search is weighted least squares over all pixels at once, and differentiates from the
+    picture back to the coefficients. The layers,
     which are expensive, depend only on the variances of the Gaussians, and are rendered once for
     many Levenberg-Marquardt steps. First the variances are fixed (`wide_variances`). Each further
     round fits `count` Gaussians to the coefficients found so far, renders their layers and the

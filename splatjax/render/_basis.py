@@ -100,7 +100,7 @@ def diffusion_basis(
 
     **Returns:** a `DiffusionBasis`; NaN where the plan does not suffice.
 
-    **Raises:** `ValueError` as `render`, and for single scattering and bounces, with which the
+    **Raises:** `ValueError` as `render` does, and for single scattering and bounces, with which the
     light that enters depends on the weights.
     """
     if scene.material.single_scattering is not None:
@@ -230,7 +230,7 @@ def relighting_basis(
 
     **Returns:** a `RelightingBasis`; NaN where the plan does not suffice.
 
-    **Raises:** `ValueError` as `render`, and for other lights.
+    **Raises:** `ValueError` as `render` does, and for other lights.
     """
     kinds = [kind.__name__ for kind in map(type, scene.lights)]
     if kinds != ["HarmonicLight"]:

@@ -26,9 +26,10 @@ _RATIO = 1000.0
 
 
 def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
-    r"""Raise for channels that disagree or too little memory, and warn of causes of black or
-    meaningless pictures: no light, inverted normals, a camera inside the body, a body smaller than
-    the distance that light travels in it, or a thousand times larger, and a light that shines away.
+    r"""Raise an error if channels disagree or memory does not suffice, and warn of likely causes
+    of black or meaningless pictures: no light, inverted normals, a camera inside the body, a body
+    that is smaller than the distance that light travels in it or a thousand times larger, and a
+    light that faces away from the body.
 
     For traced scenes, and scenes distributed over several processes, only the channels are checked.
     Each warning is shown once.

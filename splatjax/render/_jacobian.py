@@ -98,8 +98,8 @@ def picture_jacobian(
 
     **Returns:** a `PictureJacobian`; NaN where the plan does not suffice.
 
-    **Raises:** `ValueError` as `render`, for a material with single scattering unless lighting is
-    `LightAtSplats`, and for bounces.
+    **Raises:** `ValueError` as `render` does, for a material with single scattering unless lighting
+    is `LightAtSplats`, and for bounces.
     """
     if scene.material.single_scattering is not None and not isinstance(
         settings.lighting, LightAtSplats

@@ -47,8 +47,8 @@ class ShadowPlan(eqx.Module):
     lights: Int[Array, ""] | None = None
 
     def closeness(self, light: AbstractLightSample, bounds: _splatting.Bounds) -> Float[Array, ""]:
-        """Compute a number above 1 for a point light that was outside the splats' bounding sphere
-        when planned, and is now inside.
+        """Divide the radius of the splats' bounding sphere by the distance of a point light from
+        its center. Above 1, a light that was planned outside of the sphere is now inside.
         """
         if self.cube or not isinstance(light, AbstractPointSample):
             return jnp.zeros_like(bounds.radius)

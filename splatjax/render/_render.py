@@ -138,7 +138,7 @@ def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings
 
     **Returns:** a `Transfer`: 4 bytes for each splat and sample in float32.
 
-    **Raises:** `ValueError` as `illuminate`.
+    **Raises:** `ValueError` as `illuminate` does.
     """
     check_channels(scene)
     check_plan(plan, scene)
@@ -165,7 +165,7 @@ def compute_irradiance(
     **Returns:** the irradiance, and the part that spreads, `[channels, splats]` in the order of the
     scene: `source.T` is the argument of `diffuse_irradiance`.
 
-    **Raises:** `ValueError` as `illuminate`.
+    **Raises:** `ValueError` as `illuminate` does.
     """
     check_channels(scene)
     check_plan(plan, scene)

@@ -55,8 +55,8 @@ class StreamStatistics:
     - `part_size`: splats in every part but the last.
     - `middle`, `reach`: the middle of the box around all centers, and the distance to the farthest
       rim.
-    - `spacing`, `fine`: root of the mean area of the splats that have one, and the area that one in
-      a hundred of these is finer than; infinite where none has.
+    - `spacing`, `fine`: the root of the mean area, and the first percentile of the area, of the
+      splats that have one; infinite if none has.
     - `discs`: the sum of the squared radii of these splats over that of their areas.
     - `unevenness`: the mean of the unevenness of the parts, weighted by their splats.
     """

@@ -31,7 +31,7 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
     radiance: Float[Array, " channels"] = eqx.field(converter=numbers)
     strength_field: ClassVar[str] = "radiance"
     area_factor: eqx.AbstractClassVar[float]
-    """Area over that of the parallelogram of the first two axes."""
+    """Area of the light divided by the area of the parallelogram that its first two axes span."""
 
     @abc.abstractmethod
     def axes(self) -> Float[Array, "axes 3"]:

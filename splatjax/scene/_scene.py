@@ -257,8 +257,8 @@ class Frame(eqx.Module):
       weight is applied.
     - `weights`: the weights with which the layers add up to `diffuse`.
     - `diffuse`, `specular`: radiance.
-    - `unresolved_fraction`: per Gaussian, the fraction of the covered pixels in which the splats do
-      not resolve the layer, so that the surface's own irradiance replaces it.
+    - `unresolved_fraction`: per Gaussian, the fraction of its layer that the splats do not resolve,
+      averaged over the covered pixels; the surface's own irradiance replaces this fraction.
     - `single_scattering`: radiance, premultiplied; `None` when the material has none.
     - `overflow`: 0 if the capacity of the plan suffices; otherwise the largest ratio of needed to
       planned capacity, and the picture is NaN.

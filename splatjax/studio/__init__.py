@@ -1,4 +1,5 @@
-"""A scene seen live: what a change does not touch is kept. `Page` shows it in a browser, by viser
+"""An interactive view of a scene; results that a change does not affect are reused.
+`Page` shows it in a browser, by viser
 (the extra `studio`), and `widget` in a cell of a notebook (the extra `notebooks`).
 """
 

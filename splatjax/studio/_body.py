@@ -1,4 +1,4 @@
-"""What is drawn, and what was computed of it last."""
+"""The body of a session, and its most recent results."""
 
 from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
@@ -14,12 +14,11 @@ Rendered = TypeVar("Rendered", DiffusionBasis, Frame)
 
 
 class Body:
-    """Splats, lights, the size of their picture, and what was computed of them last, one of each
-    kind.
+    """Splats, lights and picture size, with the most recent result of each kind.
 
     **Arguments:**
 
-    - `settings`: with any but the usual ones, no layers are kept that any weights can blend.
+    - `settings`: layers that any weights can blend are kept only for the default settings.
     """
 
     def __init__(
@@ -51,7 +50,7 @@ class Body:
         return self.kept[kind][1]
 
     def planned(self, make: Callable[[], Rendered]) -> Rendered:
-        """Return what is rendered, with a new plan if the one that is kept does not suffice."""
+        """Render, with a new plan if the kept one does not suffice."""
         rendered = make()
         if rendered.overflow > 0:
             self.kept.clear()

@@ -1,4 +1,4 @@
-"""What can be turned in a studio."""
+"""The controls of a studio, and the changes of camera and lights that they describe."""
 
 import dataclasses
 from collections.abc import Hashable, Iterable
@@ -12,33 +12,35 @@ from splatjax.scene import AbstractLight, Camera, EnvironmentLight, Scene
 
 LAYERS = ("beauty", "diffuse", "specular", "albedo", "irradiance", "shadow")
 SURFACE = ("eta", "specular", "roughness")
-# What a medium and a skin are changed by, and derivatives are taken in.
+# The coefficients of a medium and the parameters of a skin that have sliders.
 COEFFICIENTS = {"sigma_a": "absorption", "sigma_s_prime": "scattering"}
 PIGMENTS = ("melanin", "blood", "oxygenation", "eumelanin", "bilirubin", "thickness", "scattering")
-_HIGHEST = np.radians(89)  # of a camera, from which up is still up
-# Fields of lights that are points or directions.
+_HIGHEST = np.radians(89)  # latitude of a camera: its up direction stays defined
+# The fields of lights that hold points or directions.
 _VECTORS = ("direction", "position", "origin", "center", "edges")
 
 
 @dataclasses.dataclass(frozen=True)
 class Controls:
-    r"""A state of a studio: all that the picture depends on, besides what a `Session` is made of.
+    r"""A state of a studio: everything that its picture depends on, except what its `Session` holds
+    fixed.
 
     **Attributes:**
 
-    - `eye`, `target`: of the camera, mm.
-    - `sigma_a`, `sigma_s_prime`: per channel, 1/mm; empty for a material without a medium.
-    - `g`: mean cosine of the phase function of a medium.
-    - `skin`: names and values of a `Skin`; empty without one.
-    - `eta`, `specular`, `roughness`: as those of a `Material`; `eta` is the medium's too.
-    - `factors`: on the weights of each Gaussian, one for each.
-    - `scale`: factor on all weights.
-    - `turn`: of the lights about the vertical axis, degrees.
-    - `light_stops`: of each light, by which it is brighter; each doubles it.
+    - `eye`, `target`: position of the camera, and the point at which it looks, mm.
+    - `sigma_a`, `sigma_s_prime`: coefficients per channel, 1/mm; empty for a material without a
+      medium.
+    - `g`: mean cosine of the medium's phase function.
+    - `skin`: names and values of the parameters of a `Skin`; empty without one.
+    - `eta`, `specular`, `roughness`: as in `Material`; the medium has the same `eta`.
+    - `factors`: one per Gaussian, by which its weights are multiplied.
+    - `scale`: factor for all weights.
+    - `turn`: rotation of the lights about the vertical axis, degrees.
+    - `light_stops`: for each light, the number of stops by which it is brighter.
     - `layer`: one of `LAYERS`.
-    - `exposure`: stops.
+    - `exposure`: exposure of the picture, stops.
 
-    **Raises:** `ValueError` for a layer, a `g` or factors that cannot be.
+    **Raises:** `ValueError` for an unknown layer, or a `g` or factors out of range.
     """
 
     eye: tuple[float, ...]
@@ -67,7 +69,7 @@ class Controls:
         skin: Skin | None,
         g: float,
     ) -> "Controls":
-        """Return the state of a scene as it is."""
+        """Return the state in which nothing is changed."""
         material, medium = scene.material, scene.material.medium if skin is None else None
         return cls(
             eye=plain(camera.position),
@@ -139,7 +141,7 @@ def zoomed(place: np.ndarray, log_factor: float) -> np.ndarray:
 
 
 def shifted(place: np.ndarray, across: float, down: float, fov: float) -> np.ndarray:
-    """Move a camera and its target so that the picture moves by fractions of its height.
+    """Move a camera and its target so that the picture shifts by fractions of its height.
 
     **Arguments:**
 
@@ -151,10 +153,10 @@ def shifted(place: np.ndarray, across: float, down: float, fov: float) -> np.nda
 
 
 def turned(lights: Iterable[AbstractLight], degrees: float) -> tuple[AbstractLight, ...]:
-    """Turn lights about the y axis: a positive angle turns +z towards +x. Of an environment with
-    fixed `directions` the image turns, about its own axis.
+    """Turn lights about the y axis; a positive angle turns +z towards +x. The image of an
+    environment turns about its own axis, even if its `directions` are fixed.
 
-    **Raises:** `ValueError` for a light that has neither direction nor place.
+    **Raises:** `ValueError` for a light that has neither a direction nor a position.
     """
 
     def turn(light: AbstractLight) -> AbstractLight:

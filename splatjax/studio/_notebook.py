@@ -12,19 +12,20 @@ if TYPE_CHECKING:
 
 
 def widget(session: Session, folder: str | Path = "studio") -> "Widget":
-    """Show a session in a cell of a notebook: drag the picture to orbit, or with the right button
-    to move, scroll to zoom, and click it for the parts of a pixel.
+    """Show a session in a cell of a notebook. Drag the picture to orbit, or with the right button
+    to pan; scroll to zoom; click for the parts of a pixel.
 
-    Everything passes through the connection of the notebook, so that its kernel may run on another
-    computer.
+    The widget communicates through the notebook's own connection, so that the kernel may run on
+    another computer.
 
     **Arguments:**
 
-    - `folder`: the only one to which the widget writes, under names of its own; made when needed.
+    - `folder`: the only folder to which the widget writes, under names that it chooses; created
+      when needed.
 
-    **Returns:** a widget of ipywidgets, whose `controls` are the state that it shows.
+    **Returns:** an ipywidgets widget. Its `controls` are the state that it shows.
 
-    **Raises:** `ValueError` where ipywidgets or jupyter_rfb is not installed.
+    **Raises:** `ValueError` if ipywidgets or jupyter_rfb is not installed.
     """
     for package in ("ipywidgets", "jupyter_rfb"):
         check_installed("a widget of the studio", package)

@@ -1,5 +1,5 @@
-"""The page of a studio, by viser: sliders, and the picture behind them. One thread computes, in
-which programs are also compiled, so that the page answers meanwhile.
+"""The page of a studio, by viser: sliders, and the picture behind them. One thread computes and
+compiles, so that the page stays responsive.
 """
 
 import contextlib
@@ -38,23 +38,24 @@ _QUALITY = 92  # of JPEG
 
 
 class Page:
-    """A session in a browser, or at the end of a notebook's cell. All pages that are open show one
-    picture; the last camera that moves is that of all.
+    """A session in a browser, or at the end of a notebook's cell. All open pages show the same
+    picture, from the camera that was moved last.
 
     **Arguments:**
 
-    - `folder`: the only one to which the page writes, under names of its own; made if missing.
-    - `as_file`: as for `save`.
-    - `observations`: pictures of the body, the first of which has the session's camera and lights.
-      The page then offers to recover the material, and shows how the search proceeds.
-    - `host`: the address to listen at: by default no other computer reaches it.
-    - `port`: or a higher one that is free.
+    - `folder`: the only folder to which the page writes, under names that it chooses; created if
+      missing.
+    - `as_file`: see `save`.
+    - `observations`: pictures of the body; the first has the camera and lights of the session. The
+      page then offers to recover the material from them, and shows the progress of the search.
+    - `host`: the address to listen on; by default only this computer can open the page.
+    - `port`: the port to listen on, or the next higher one that is free.
 
     **Attributes:**
 
-    - `url`: its address.
+    - `url`: the address of the page.
 
-    **Raises:** `ValueError` where viser is not installed.
+    **Raises:** `ValueError` if viser is not installed.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class Page:
         self._worker.start()
 
     def close(self) -> None:
-        """End the server, once what is being computed is done."""
+        """Stop the server after the current computation."""
         if self._observations:
             self._search.stop()
             self._search.join()
@@ -141,13 +142,13 @@ class Page:
         buttons.on_click(press)
 
     def _follow(self, stage: str, medium: Medium | None) -> None:
-        """Show a stage of the search: sliders and picture become those of its medium."""
+        """Show a stage of the search, and move the sliders to its medium."""
         self._stage.content = f"```\n{stage}\n```"
         if medium is not None:
             self._panel.move(values_of_medium(self._session.start, medium))
 
     def _compare(self, picture: np.ndarray) -> None:
-        """Show the first picture, and half the difference of another of the same camera to it."""
+        """Show the first picture beside half its difference from the rendered one."""
         difference = 128 + (picture.astype(int) - self._target) // 2
         self._compared.image = np.hstack([self._target, difference.astype(np.uint8)])
 
@@ -155,7 +156,7 @@ class Page:
         return f'<iframe src="{self.url}" style="width: 100%; height: 600px; border: 0"></iframe>'
 
     def _look_again(self) -> None:
-        """Let all pages look from the first place."""
+        """Move the cameras of all pages to the first view."""
         start = self._session.start
         for client in self._joined:
             client.camera.position, client.camera.look_at = start.eye, start.target
@@ -171,7 +172,7 @@ class Page:
 
     def _join(self, client: Any) -> None:
         def look(camera: Any) -> None:
-            with self._looking:  # viser calls from several threads, perhaps for what is past
+            with self._looking:  # viser calls this from several threads
                 self._look(camera)
 
         client.camera.on_update(look)
@@ -180,7 +181,7 @@ class Page:
         place, start = np.asarray([camera.position, camera.look_at]), self._session.start
         near = _NEAR * np.linalg.norm(place[0] - place[1])
         if camera.client not in self._joined:
-            # Its first cameras are viser's own, and then the first of all.
+            # At first viser sends cameras of its own, and then the one that the page starts with.
             if np.max(np.abs(place - [start.eye, start.target])) < near:
                 self._joined.append(camera.client)
                 camera.position, camera.look_at = self._place
@@ -192,7 +193,7 @@ class Page:
             self._send(camera.client)
 
     def _pick(self, event: Any) -> None:
-        """Choose the pixel at which a page was clicked; none beside the picture."""
+        """Choose the pixel that was clicked, or none outside of the picture."""
         camera, (x, y) = self._session.camera(self._session.start), event.screen_pos
         width, height = _canvas(camera.width, camera.height, event.client)
         column, row = int(x * width - (width - camera.width) // 2), int(y * height)
@@ -212,9 +213,7 @@ class Page:
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
     def _send(self, client: Any) -> None:
-        """Show the picture in a window of any shape: in the middle, or at the top, above the
-        controls.
-        """
+        """Show the picture in a window of any shape: centered, or in a tall window at the top."""
         size = _canvas(*self._image.size, client)
         canvas = np.asarray(ImageOps.pad(self._image, size, centering=(0.5, 0.0)))
         client.scene.set_background_image(canvas, "jpeg", jpeg_quality=_QUALITY)
@@ -238,7 +237,7 @@ class Page:
                 self._status.content = sentence_of(error)
 
     def _update(self, controls: Controls) -> str:
-        """Show a state, and write what is to be saved; return what to report."""
+        """Show a state, save what was requested, and return the text of the status line."""
         session, written = self._session, list[Path]()
         self._show(session.draft(controls))
         self._panel.show(controls)
@@ -260,6 +259,6 @@ class Page:
 
 
 def _canvas(width: int, height: int, client: Any) -> tuple[int, int]:
-    """Return the size of the least canvas around a picture that has the shape of a window."""
+    """Return the size of the smallest canvas with the shape of a window that holds a picture."""
     aspect = client.camera.aspect
     return max(width, round(height * aspect)), max(height, round(width / aspect))

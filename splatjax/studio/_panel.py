@@ -76,6 +76,6 @@ class Panel:
             self.handles[name].value = value
 
     def show(self, controls: Controls) -> None:
-        """Show the coefficients and the profile of a state."""
+        """Display the coefficients and the profile of a state."""
         self._plot.data = tuple(self._session.curves(controls))
         self._numbers.content = "  \n".join(coefficient_lines(controls))

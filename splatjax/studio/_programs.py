@@ -1,4 +1,4 @@
-"""What a session computes while a slider moves: one compiled program each."""
+"""The compiled programs that run while a slider moves."""
 
 from dataclasses import replace
 from typing import TypeAlias
@@ -21,7 +21,7 @@ _WEIGHTS = _fitting.NonNegativeWeights(_fitting.FixedTotalReflectance())
 def blend(
     basis: DiffusionBasis, gaussians: SumOfGaussians, shares: Float[Array, "2"]
 ) -> Float[Array, "height width channels"]:
-    """Compute a picture of these shares of diffuse and of specular light."""
+    """Compute a picture from shares of its diffuse and its specular light."""
     return shares[0] * (basis.beauty(gaussians) - basis.specular) + shares[1] * basis.specular
 
 
@@ -29,7 +29,7 @@ def blend(
 def light_of_gaussians(
     basis: DiffusionBasis, gaussians: SumOfGaussians, place: tuple[int, int]
 ) -> Float[Array, "gaussians channels"]:
-    """Compute what each Gaussian adds to the radiance of the pixel of a row and a column."""
+    """Compute the contribution of each Gaussian to the radiance of a pixel (row, column)."""
     layers, _ = basis.light.weigh(gaussians, jnp.zeros_like(gaussians.weights[0]))
     radiance = gaussians.weights[:, :, None] * layers * basis.pixel_radiance_per_exitance[None]
     row, column = place
@@ -47,8 +47,8 @@ def changes_with_coefficients(
     basis: DiffusionBasis,
     place: tuple[int, int],
 ) -> list[Float[Array, " channels"]]:
-    """Differentiate the radiance of a pixel with respect to the logarithms of fields. No channel
-    depends on the coefficients of another.
+    """Differentiate the radiance of a pixel with respect to the logarithms of the named fields. A
+    channel depends only on its own coefficients.
     """
 
     def change(name: str) -> Float[Array, " channels"]:
@@ -67,7 +67,7 @@ def changes_with_coefficients(
 def weights_of(
     model: _fitting.AbstractModel, optics: Optics, variances: Float[Array, " gaussians"]
 ) -> SumOfGaussians:
-    """Fit the weights to coefficients, for held variances."""
+    """Fit the weights to coefficients while the variances are held."""
     return _fitting.fit_weights(model.profile(optics), variances, weights=_WEIGHTS, rule=model.rule)
 
 
@@ -75,7 +75,7 @@ def weights_of(
 def variances_and_angles(
     model: _fitting.AbstractModel, optics: Optics, variances: Float[Array, " gaussians"]
 ) -> tuple[Float[Array, " gaussians"], AngularLaw | None]:
-    """Find variances near given ones, which stay where none better is found; and the angles."""
+    """Improve the variances, if better ones lie near the given ones, and compute the angles."""
     profile, start = model.profile(optics), _fitting.GivenVariances(variances)
     fitted = _fitting.fit_gaussians(
         profile, len(variances), weights=_WEIGHTS, start=start, rule=model.rule, throw=False
@@ -93,6 +93,6 @@ def profile_curves(
     gaussians: SumOfGaussians,
     radii: Float[Array, " radii"],
 ) -> list[Float[Array, " radii"]]:
-    """Compute the profile, where there are coefficients, and the sum of Gaussians, times r."""
+    """Compute the profile, if there are coefficients, and the sum of Gaussians, both times r."""
     profiles = [gaussians] if optics is None else [model.profile(optics), gaussians]
     return [radii * row for profile in profiles for row in profile(radii).T]

@@ -1,4 +1,4 @@
-"""What a studio writes: files under names of its own, in one folder."""
+"""The files that a studio saves in one folder."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -48,12 +48,13 @@ def save(
 
     **Arguments:**
 
-    - `as_file`: of a folder, material, lights and camera, returns the contents of a scene's file
-      there, which names the files of body and lights. Without it, they are written too.
+    - `as_file`: a function of a folder, material, lights and camera that returns the contents of a
+      scene file in this folder, with references to existing files of the body and the lights.
+      Without it, these files are written too.
 
     **Returns:** the paths of the files.
 
-    **Raises:** `KeyError` for anything else, `OSError` where files cannot be written.
+    **Raises:** `KeyError` for any other kind, `OSError` where files cannot be written.
     """
     session.picture(controls)  # whose variances and angles are those of the coefficients
     scene, camera = session.scene(controls), session.camera(controls)

@@ -1,4 +1,4 @@
-"""The search for a material behind a page: `splatjax.inverse.recover` in a thread of its own."""
+"""`splatjax.inverse.recover` in the background, for a page."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -16,18 +16,18 @@ from ._session import Session
 
 
 class _Stopped(Exception):
-    """The search is to end."""
+    """Raised to end the search."""
 
 
 class Search:
-    r"""A recovery of the material of a session from pictures of its body. It ends between two
-    rounds of the search when it is stopped, and may start again from what it has found.
+    r"""Recovers the material of a session from pictures of its body, in a thread. `stop` ends the
+    search after the current round; `start` may then continue from the result.
 
     **Arguments:**
 
     - `observations`: the pictures, at least one.
-    - `report`: called from the thread of the search with a description of each stage and the best
-      medium so far; at last with the summary, or with an error and no medium.
+    - `report`: called in the thread of the search with a description of each stage and the best
+      medium so far, and at the end with the summary, or with an error and no medium.
 
     **Raises:** `ValueError` for a material without a medium.
     """
@@ -47,7 +47,7 @@ class Search:
         self._thread, self._stopped = threading.Thread(), threading.Event()
 
     def start(self, controls: Controls) -> None:
-        """Search from the coefficients of a state, unless a search runs."""
+        """Search from the coefficients of a state, unless a search is already running."""
         if not self._thread.is_alive():
             self._stopped.clear()
             material = self._session.scene(controls).material
@@ -56,11 +56,11 @@ class Search:
             self._thread.start()
 
     def stop(self) -> None:
-        """End the search at its next stage."""
+        """End the search after its current stage."""
         self._stopped.set()
 
     def join(self) -> None:
-        """Wait until no search runs."""
+        """Wait until the search has ended."""
         if self._thread.is_alive():
             self._thread.join()
 
@@ -71,7 +71,7 @@ class Search:
             self._report(stage, medium)
 
         body = self._session.own.splats
-        # Without albedo: coefficients give color.
+        # Without an albedo the coefficients determine the color.
         splats = Splats(body.centers, body.normals, body.radii, body.areas)
         try:
             with jax.enable_x64(True):

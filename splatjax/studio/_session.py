@@ -1,4 +1,4 @@
-"""A scene whose parts are kept, each until something that it depends on changes."""
+"""A scene that keeps intermediate results until something that they depend on changes."""
 
 import dataclasses
 from collections.abc import Hashable
@@ -50,33 +50,36 @@ from ._programs import (
     weights_of,
 )
 
-_DIRECTIONS = 64  # of the shadows of an environment that turns
-_MERGED = 6  # splats of the body, for which one stands while it moves
-_WIDER = 1.25  # than as many splats as even as those of the body, so that few holes open
-_PLANNED = 1.2  # by which variances may differ from those of a plan
-_QUARTERS = (0.0, 90.0, 180.0, 270.0)  # degrees
-_DISTANCES = (1.0, 0.5)  # that are planned for, over that of the first camera
-# How much of diffuse and of specular light a layer shows.
+_DIRECTIONS = 64  # shadow directions of an environment that turns
+_MERGED = 6  # splats of the body per splat of a draft
+_WIDER = 1.25  # additional factor for the radii of a draft, which closes holes between its splats
+_PLANNED = 1.2  # factor by which variances may change before a new plan is made
+# Planned cameras: degrees around the target, and distances relative to the first camera's.
+_QUARTERS = (0.0, 90.0, 180.0, 270.0)
+_DISTANCES = (1.0, 0.5)
+# The shares of diffuse and of specular light in a layer.
 _SHARES = {"beauty": (1.0, 1.0), "diffuse": (1.0, 0.0), "specular": (0.0, 1.0)}
 
 
 class Session:
     r"""A scene under changing controls.
 
-    Of each kind one result is kept: the visibility of the lights, the light on the splats, and the
-    layers of the view (`splatjax.DiffusionBasis`). While coefficients move, the variances of the
-    Gaussians are held, their weights are fitted, and the kept layers are blended. Where nothing is
-    kept for a state, `draft` shows a sixth of the splats in half the width and height. Drafts
-    have the usual settings.
+    A session keeps the most recent result of each kind: the visibility of the lights, the light on
+    the splats, and the layers of the view (`splatjax.DiffusionBasis`). While coefficients change,
+    the variances of the Gaussians are held, only their weights are fitted, and the kept layers are
+    blended. If no layers are kept for a state, `draft` renders a sixth of the splats at half the
+    width and height. Drafts use the default settings.
 
     **Arguments:**
 
-    - `scene`: a material without single scattering. Where the splats have an albedo, color is that
-      alone. A draft shows an environment by 64 even directions unless it has its own.
-    - `camera`: of the first picture.
-    - `target`: at which it looks, mm.
-    - `settings`: of the pictures, such as bounces.
-    - `skin`: from which the material was fitted; its pigments change instead of a medium.
+    - `scene`: its material has no single scattering. If the splats have an albedo, the albedo alone
+      gives the color. In drafts an environment without `directions` has 64 even ones.
+    - `camera`: camera of the first picture.
+    - `target`: the point at which it looks, mm.
+    - `settings`: settings of full pictures, such as bounces.
+    - `exposure`: exposure of the first picture, stops.
+    - `skin`: the skin to which the material was fitted; its pigments then change instead of the
+      coefficients of a medium.
     - `g`: mean cosine of the phase function of the material's medium.
 
     **Attributes:**
@@ -125,15 +128,15 @@ class Session:
 
     def picture(self, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
         """Compute the picture that `splatjax.render` makes of `scene(controls)`, for a display.
-        Before, variances and angles follow the coefficients.
+        Variances and angles are first fitted to the coefficients.
         """
         self._settle(controls)
         self._basis(self._full, controls)  # for drafts
         return self._show(self._still, controls)
 
     def draft(self, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
-        """Compute a picture at once: of the layers that are kept, with the variances and angles of
-        the last `picture`; or a coarse one.
+        """Compute a picture at once: from kept layers, with the variances and angles of the last
+        `picture`, or else a coarse one.
         """
         is_kept = self._full.has("basis", self._keys(controls, self._full))
         return self._show(self._full if is_kept else self._coarse, controls)
@@ -152,11 +155,12 @@ class Session:
     def pixel(
         self, controls: Controls, column: int, row: int
     ) -> dict[str, Float[np.ndarray, " channels"]]:
-        """Take a pixel of the picture apart.
+        """Decompose the radiance of a pixel.
 
-        **Returns:** per channel, its radiance, its highlight, and the light that each Gaussian
-        spreads, by its width; where there are coefficients, also the change of the radiance with
-        the logarithms of absorption and of scattering, or of melanin and blood, for held variances.
+        **Returns:** for each channel, its radiance, its highlight, and the contribution of each
+        Gaussian, labeled by its width. If there are coefficients, also the derivatives of the
+        radiance with respect to the logarithms of absorption and scattering, or of melanin and
+        blood, with the variances held.
         """
         basis, gaussians = self._basis(self._full, controls), self._gaussians(controls)
         place, optics = (row, column), self.optics(controls)
@@ -175,8 +179,8 @@ class Session:
         return {name: np.asarray(values, np.float64) for name, values in parts.items()}
 
     def scene(self, controls: Controls, body: Body | None = None, **surface: float) -> Scene:
-        """Return the scene of a state: after `picture`, that of the picture. Its material has no
-        medium if its weights are not those of one.
+        """Return the scene of a state; after `picture`, the scene of that picture. Its material has
+        no medium if the weights were changed by hand.
         """
         surface = {name: getattr(controls, name) for name in SURFACE} | surface
         material = dataclasses.replace(
@@ -199,10 +203,10 @@ class Session:
         return Camera.look_at(controls.eye, controls.target, fov=self.fov, **size)
 
     def curves(self, controls: Controls) -> list[np.ndarray]:
-        """Compute what a drawing of the profile shows.
+        """Compute the curves of a plot of the profile and its fit.
 
-        **Returns:** radii (mm); of each channel the profile times the radius, 1/mm, where there are
-        coefficients; and the same of the Gaussians.
+        **Returns:** radii (mm); for each channel, if there are coefficients, the profile times the
+        radius (1/mm); and for each channel the sum of Gaussians times the radius.
         """
         optics, gaussians = self.optics(controls), self._fitted(controls)
         widest = 3 * np.sqrt(np.max(self.own.material.gaussians.variances))
@@ -211,13 +215,13 @@ class Session:
         return [np.asarray(row, np.float64) for row in (radii, *rows)]
 
     def model(self, controls: Controls) -> _fitting.AbstractModel:
-        """Return the model by which the Gaussians of a state follow from its optics."""
+        """Return the model that fits Gaussians to the coefficients or pigments of a state."""
         if self.skin is not None:
             return _fitting.SkinModel(spectrum_to_rgb(self.skin.wavelengths))
         return _fitting.TransportModel(jnp.asarray(controls.g, self._variances.dtype))
 
     def optics(self, controls: Controls) -> Optics | None:
-        """Return the medium or the skin of a state, if there is one."""
+        """Return the medium or the skin of a state, if it has one."""
         own = self.own.material.medium if self.skin is None else self.skin
         if own is None or controls.coefficients == self.start.coefficients:
             return own
@@ -227,7 +231,7 @@ class Session:
         return Medium(*(jnp.asarray(row, self._variances.dtype) for row in rows))
 
     def _fitted(self, controls: Controls) -> SumOfGaussians:
-        """Return the material's own Gaussians, or those that stand for changed coefficients."""
+        """Return the material's own Gaussians, or Gaussians fitted to changed coefficients."""
         gaussians, optics = self.own.material.gaussians, self.optics(controls)
         is_own = optics is self.optics(self.start) and self._variances is gaussians.variances
         if optics is None or is_own:
@@ -238,7 +242,7 @@ class Session:
         return self._last_fit[1]
 
     def _gaussians(self, controls: Controls) -> SumOfGaussians:
-        """Return the Gaussians of a state; where splats have color, factors change only widths."""
+        """Return the Gaussians of a state. If splats have an albedo, factors change no color."""
         gaussians = self._fitted(controls)
         factors = jnp.asarray(controls.factors, gaussians.weights.dtype)[:, None]
         gaussians = SumOfGaussians(gaussians.variances, gaussians.weights * factors)
@@ -250,7 +254,7 @@ class Session:
         return self.own.splats.albedo is None
 
     def _settle(self, controls: Controls) -> None:
-        """Let variances and angles follow the coefficients."""
+        """Fit variances and angles to the coefficients."""
         if controls.coefficients == self._settled:
             return
         material, optics = self.own.material, self.optics(controls)
@@ -264,7 +268,7 @@ class Session:
             self._planned = self._variances
 
     def _keys(self, controls: Controls, body: Body) -> tuple[Hashable, Hashable]:
-        """Return what the light on the splats depends on, and what the view does besides."""
+        """Return keys of the light on the splats, and of the view."""
         of_any_view = {"eye": (), "target": (), "layer": LAYERS[0], "exposure": 0.0}
         state: Hashable = dataclasses.replace(controls, **of_any_view)
         if body.is_blended:
@@ -272,7 +276,7 @@ class Session:
         return (state, self._fits), (controls.eye, controls.target)
 
     def _plan(self, body: Body, controls: Controls) -> Plan:
-        """Plan for cameras and lights all around."""
+        """Plan for cameras and lights from all sides."""
 
         def make() -> Plan:
             start, scene = self.start, self.scene(controls, body)

@@ -1,4 +1,4 @@
-"""What pages and widgets have in common: the sliders, what they stand for, and sentences."""
+"""Sliders, their meaning, and messages, which pages and widgets share."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ _PIGMENTS = {
 
 
 class Slider(NamedTuple):
-    """One number of a state: its name, by which `controls_of` knows it, and what a page shows."""
+    """A slider for one number of a state. `controls_of` finds its value by `name`."""
 
     name: str
     label: str
@@ -51,13 +51,13 @@ class Slider(NamedTuple):
 
 
 def sliders(session: Session) -> list[Slider]:
-    """List the sliders of a session, those of a folder one after another."""
+    """List the sliders of a session, grouped by folder."""
     start, found = session.start, list[Slider]()
 
     def add(name: str, label: str, low: float, high: float, value: float, *folder: Any) -> None:
         found.append(Slider(name, label, min(low, value), max(high, value), value, *folder))
 
-    # The diffusion equation knows no weights.
+    # The diffusion equation uses no weights.
     has_weights = not isinstance(session.settings.diffuser, ShapeDiffuser)
     for name, slider in _GENERAL.items():
         if name != "scale" or has_weights:
@@ -80,7 +80,7 @@ def sliders(session: Session) -> list[Slider]:
 
 
 def controls_of(start: Controls, values: Mapping[str, Any], place: np.ndarray) -> Controls:
-    """Return the state that the values of sliders, and a camera's place and target, give."""
+    """Return the state given by the values of sliders, and by a camera's position and target."""
     eye, target = place.tolist()
     changed = {name: value for name, value in values.items() if " " not in name}
     for field in COEFFICIENTS:
@@ -96,7 +96,7 @@ def controls_of(start: Controls, values: Mapping[str, Any], place: np.ndarray) -
 
 
 def values_of_medium(start: Controls, medium: Medium) -> dict[str, float]:
-    """Return where sliders stand for the coefficients of a medium, as far as they reach."""
+    """Return the values of sliders for the coefficients of a medium, within the sliders' ends."""
     values = dict[str, float]()
     for field in COEFFICIENTS:
         powers = np.log2(np.asarray(getattr(medium, field)) / np.asarray(getattr(start, field)))
@@ -112,13 +112,13 @@ def coefficient_lines(controls: Controls) -> list[str]:
 
 
 def sentence_of(error: Exception) -> str:
-    """Return what to show of an error."""
+    """Return a sentence about an error, for a page."""
     is_clear = isinstance(error, (OSError, ValueError))
     return str(error) if is_clear else f"{type(error).__name__}: {error}"
 
 
 def pixel_rows(session: Session, controls: Controls, pixel: tuple[int, int]) -> list[list[str]]:
-    """Tabulate the parts of a pixel, below their titles; one cell if it shows no surface."""
+    """Tabulate the parts of a pixel below their titles; a single cell if it shows no surface."""
     parts, title = session.pixel(controls, *pixel), "pixel {}, {}".format(*pixel)
     if not np.any(parts["radiance"]):
         return [[f"{title} shows no surface"]]

@@ -1,4 +1,4 @@
-"""The studio in a cell of a notebook, by ipywidgets and jupyter_rfb: it passes through the
+"""The studio in a cell of a notebook, by ipywidgets and jupyter_rfb. It communicates through the
 notebook's own connection, so that the kernel may run on another computer.
 """
 
@@ -32,7 +32,7 @@ from ._sliders import (
 )
 
 _LEFT, _RIGHT = (1,), (2,)  # buttons of a mouse
-_CLICK = 3  # pixels, within which a button that is pressed and released picks one
+_CLICK = 3  # pixels by which a mouse may move in a click
 
 
 class _Canvas(RemoteFrameBuffer):
@@ -116,7 +116,7 @@ class Widget(ipywidgets.HBox):
         return shown
 
     def _draft(self) -> np.ndarray:
-        """Compute a picture at once, and the whole one when nothing has changed for a moment."""
+        """Compute a draft, and schedule the full picture for when nothing moves."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = asyncio.get_running_loop().call_later(STILL, self._settle)
@@ -127,7 +127,7 @@ class Widget(ipywidgets.HBox):
         self._report(self._show_all)
 
     def _report(self, action: Callable[[], str]) -> None:
-        """Do something slow, and show the sentence that it returns or raises."""
+        """Run a slow action, and show the text that it returns or its error."""
         try:
             with watched_compiling(self._note_compiling):
                 self._status.value = action()
@@ -147,7 +147,7 @@ class Widget(ipywidgets.HBox):
         return "" if picture.any() else UNSEEN
 
     def _drawn(self, controls: Controls) -> str:
-        """Draw the profile and its fit."""
+        """Plot the profile and its fit as SVG."""
         radii, *rows = self._session.curves(controls)
         channels = self._session.own.material.channels
         figure = Figure(figsize=(4.2, 2.4), layout="constrained")
@@ -177,7 +177,7 @@ class Widget(ipywidgets.HBox):
         self._canvas.request_draw()
 
     def _follow(self, event: dict[str, Any]) -> None:
-        """Move the camera as a mouse is dragged, or choose the pixel that it clicks."""
+        """Move the camera as the mouse is dragged, or choose the pixel that is clicked."""
         kind = event["type"]
         if kind == "wheel":
             self._look(zoomed(self._place, event["dy"] / 500))
