@@ -51,7 +51,6 @@ from ._problem import (
 from ._recovery import Combination, Recovery, best_and_worst, inverse
 
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
-
 _ROUNDS = 8
 _SAME_INDEX = 1e-4
 # Rounds end when no coefficient changes by more than this, or by a tenth of its error bar.
