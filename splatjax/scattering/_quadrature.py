@@ -71,12 +71,11 @@ class RadialRule(AbstractRadialRule):
     def radii(
         self, profile: AbstractProfile
     ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
-        """Compute the radii and weights for each channel, mm. They are constants of every
-        derivative.
+        """Compute the radii and weights for each channel, mm. Differentiable.
 
         A measured profile has its own radii; those outside of the rule have weight 0.
         """
-        scale = jax.lax.stop_gradient(profile.length_scale())
+        scale = profile.length_scale()
         measured = jax.lax.stop_gradient(profile.known_radii())
         nodes = measured or _nodes(self.smallest, self.largest, self.count, self.near)
         shape = (*nodes[0].shape, *scale.shape)

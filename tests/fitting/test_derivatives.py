@@ -48,10 +48,16 @@ def of_fit(spread, weights, start=None):
     return fit
 
 
+def of_transport(point):
+    """Of the default model, whose rule starts at half a mean free path, which moves too."""
+    model = sj.fitting.TransportModel()
+    profile = model.profile(Medium(*jnp.exp(point).reshape(3, 2)))
+    fitted = fit_gaussians(profile, 3, weights=HELD, rule=model.rule)
+    logarithms = jnp.log(fitted.gaussians.variances)
+    return jnp.concatenate([logarithms, fitted.gaussians.weights.ravel(), fitted.error])
+
+
 def of_weights(point):
-    """Of given variances. Nodes of the integrals are constants of the derivative, and they move
-    with the medium: an integral has none.
-    """
     profile = Dipole(Medium(*jnp.exp(point).reshape(3, 2)))
     variances = jnp.asarray([0.05, 0.3, 2.0, 15.0])
     return sj.fitting.fit_weights(profile, variances, weights=HELD).weights.ravel()
@@ -68,6 +74,7 @@ REFITTED = {
         MARBLE_RED_AND_BLUE,
         jax.jacrev,
     ),
+    "transport": (of_transport, np.log([0.03, 0.12, 1.5, 1.8, 1.45, 1.45]), jax.jacfwd),
     "weights": (of_weights, np.log([0.02, 0.2, 1.0, 0.7, 1.3, 1.3]), jax.jacfwd),
 }
 
