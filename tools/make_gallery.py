@@ -46,12 +46,9 @@ def fitted(profile: sj.gaussians.AbstractProfile, eta: float, specular: float, r
 
 def transported(medium: sj.Medium, specular: float, roughness: float) -> sj.Material:
     """Return a material fitted to light transport, as `splatjax fit` makes it."""
-    model = sj.fitting.TransportModel()
     with jax.enable_x64(True):
         medium = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), medium)
-        profile, angles = model.profile(medium), model.angles(medium)
-        gaussians = sj.fit_gaussians(profile, 6, weights=HELD, rule=model.rule).gaussians
-        made = sj.Material(gaussians, medium.eta[0], specular, roughness, angles=angles)
+        made = sj.Material.of_medium(medium, specular=specular, roughness=roughness)
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), made)
 
 

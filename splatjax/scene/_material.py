@@ -1,6 +1,7 @@
 """Translucent materials: their Gaussians, their surface, and the angles of their light."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,6 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._records import numbers, record, valid
+from splatjax.fitting import (
+    AbstractModel,
+    FixedTotalReflectance,
+    LeastCount,
+    NonNegativeWeights,
+    TransportModel,
+    fit_gaussians,
+)
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import ANGULAR_POWERS, AngularLaw, Medium, SingleScattering
 
@@ -20,6 +29,7 @@ class Material(eqx.Module):
     r"""A translucent material: the diffusion below the surface, and the reflection at the surface.
 
         material = load_material("marble")
+        material = Material.of_medium(Medium([0.02, 0.006, 0.015], [1.1, 1.3, 1.5], eta=1.6))
         material = Material(fit_gaussians(Dipole(load_medium("marble"))).gaussians, eta=1.5)
 
     **Attributes:** (all differentiable)
@@ -64,6 +74,33 @@ class Material(eqx.Module):
                     f"Material.{name} has {term.channels} channels, and Material.gaussians has "
                     f"{self.channels}; give both the same number"
                 )
+
+    @classmethod
+    def of_medium(
+        cls,
+        medium: Medium,
+        count: int | LeastCount = 6,
+        *,
+        model: AbstractModel = TransportModel(),
+        **surface: Any,
+    ) -> "Material":
+        """Fit a material to optical coefficients, as `splatjax fit` does. Differentiable in the
+        medium. The fit is as precise as the medium: create it in float64
+        (`jax.enable_x64`) for the numbers of the command.
+
+        **Arguments:**
+
+        - `count`: number of Gaussians.
+        - `model`: the model of the profile; by default light transport, `TransportModel(g=0.8)` for
+          light that scatters forward.
+        - `surface`: `specular`, `roughness`, and `eta`, by default the medium's.
+
+        **Raises:** `ValueError` as `fit_gaussians` does.
+        """
+        held = NonNegativeWeights(FixedTotalReflectance())
+        fitted = fit_gaussians(model.profile(medium), count, weights=held, rule=model.rule)
+        surface = {"eta": medium.eta[0]} | surface
+        return cls(fitted.gaussians, angles=model.angles(medium), medium=medium, **surface)
 
     @property
     def channels(self) -> int:

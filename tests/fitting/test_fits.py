@@ -250,3 +250,11 @@ def test_many_media_compile_one_program_for_each_count(compiled, count_of_media,
             start = GivenVariances(np.geomspace(0.1, 9, count))
             fit_gaussians(sj.Dipole(medium), count, start=start, throw=False)
     assert compiled.count("jit(_fit_compiled)") == len(counts)
+
+
+def test_a_material_of_a_medium_is_the_one_in_the_library(float64):
+    marble = sj.load_material("marble")
+    surface = {"specular": marble.specular, "roughness": marble.roughness}
+    made = sj.Material.of_medium(sj.load_medium("marble"), **surface)
+    for found, expected in zip(jax.tree.leaves(made), jax.tree.leaves(marble), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
