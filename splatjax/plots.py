@@ -99,7 +99,7 @@ def plot_fit(
     log.set_title("logarithmic, with each Gaussian (gray)", fontsize="medium")
     residual.axhline(0, color="0.6", linewidth=0.8)
     residual.set(xlabel="r (mm)", ylabel="fit / R - 1", xlim=ends)
-    residual.set_title("relative error, to a hundredth of the light's density", fontsize="medium")
+    residual.set_title("relative error where r² R(r) exceeds 1% of its maximum", fontsize="medium")
     if not rule.reaches_origin:
         nodes, weights = (np.asarray(values) for values in rule.radii(profile))
         begin = float(nodes[weights > 0].min())

@@ -152,16 +152,18 @@ class Recover:
                 sj.io.write_record(search, {"made of": dependencies, **values})
 
         gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, starts[0].eta.shape[0])))
-        recovery = sj.inverse.recover(
-            observations,
-            splats,
-            starts,
-            surface=sj.Material(gaussians, starts[0].eta[0], self.specular, self.roughness),
-            model=model_by_name(self.model, self.g),
-            count=self.count,
-            loss=sj.inverse.HuberLoss() if self.robust else sj.inverse.SquaredLoss(),
-            progress=report,
-        )
+        compiling = ["compiling, for a minute or two; kept for later runs"]
+        with sj.cache.watched_compiling(lambda: note(compiling.pop()) if compiling else None):
+            recovery = sj.inverse.recover(
+                observations,
+                splats,
+                starts,
+                surface=sj.Material(gaussians, starts[0].eta[0], self.specular, self.roughness),
+                model=model_by_name(self.model, self.g),
+                count=self.count,
+                loss=sj.inverse.HuberLoss() if self.robust else sj.inverse.SquaredLoss(),
+                progress=report,
+            )
         settled = recovery.result == optx.RESULTS.successful
         effort = f"{counted(recovery.rounds, 'round')} and {counted(recovery.steps, 'step')}"
         note(
@@ -235,7 +237,7 @@ class Recover:
                 ),
                 "relative_error_of_sigma_a": np.asarray(errors[0]).tolist(),
                 "relative_error_of_sigma_s_prime": np.asarray(errors[1]).tolist(),
-                "chi_squared": float(recovery.chi_squared),
+                **({"chi_squared": float(recovery.chi_squared)} if recovery.noise_is_known else {}),
             },
             fit={
                 **({} if model.description is None else {"profile": model.description}),

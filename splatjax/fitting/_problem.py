@@ -21,8 +21,8 @@ def norm_radii(
     if profile.singular and rule.reaches_origin:
         raise ValueError(
             f"{type(profile).__name__} diverges like 1/r, so the integral of r R^2 from 0 (Eq. "
-            "3) does not exist; give the radius where it starts, in length scales of the "
-            "profile: rule=L2_QUADRATURE.beyond(1.0)"
+            "3) does not exist; give the rule of a model (TransportModel.rule), or the radius "
+            "where it starts, in length scales: rule=scattering.L2_QUADRATURE.beyond(1.0)"
         )
     return rule.radii(profile)
 

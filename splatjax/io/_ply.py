@@ -1,7 +1,6 @@
 """Splats in PLY files, read at once or, for files that are larger than memory, part by part."""
 
 import re
-import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -104,10 +103,7 @@ def read_splats(
     centers = fields.pop("centers")
     _check_places(path, centers, estimated=fields["radii"] is None or fields["areas"] is None)
     if fields["radii"] is None and columns.get("face"):
-        warnings.warn(
-            f"{path}: has faces, and only their corners are read, as points; {_COVER.format(path)}",
-            stacklevel=2,
-        )
+        raise ValueError(f"{path}: is a mesh; {_COVER.format(path)}")
     with naming(path):
         return complete_splats(centers, **fields)
 

@@ -3,6 +3,7 @@ notebook's own connection, so that the kernel may run on another computer.
 """
 
 import asyncio
+import contextlib
 import io
 import itertools
 from collections.abc import Callable
@@ -40,7 +41,8 @@ class _Canvas(RemoteFrameBuffer):
 
     def __init__(self, widget: "Widget", width: int, height: int):
         size = {"css_width": f"{width}px", "css_height": f"{height}px"}
-        super().__init__(resizable=False, cursor="grab", **size)
+        with contextlib.redirect_stdout(io.StringIO()):  # outside of a notebook it prints
+            super().__init__(resizable=False, cursor="grab", **size)
         self._widget = widget
 
     def get_frame(self) -> np.ndarray:

@@ -113,6 +113,8 @@ def seeds(name: str, folder: Path) -> list[Path]:
     if name in ("ply", "ply_mesh", "obj", "glb", "stl", "off"):
         mesh = trimesh.creation.icosahedron()
         mesh.visual.vertex_colors = [10, 20, 30, 255]
+        if name == "ply":
+            mesh = trimesh.PointCloud(mesh.vertices, [10, 20, 30, 255])
         paths.append(folder / f"colored{suffix}")
         mesh.export(paths[-1])
     elif name == "picture":

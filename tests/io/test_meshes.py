@@ -16,7 +16,7 @@ import meshio
 import numpy as np
 import pytest
 import trimesh
-from bodies import unit
+from bodies import assert_refused, unit
 from PIL import Image
 from scipy.spatial import KDTree
 from writers import SUFFIXES, columns_of, export, some_splats, write_ply, xyz
@@ -270,11 +270,12 @@ def test_integers_are_srgb_and_floats_are_linear(tmp_path, kind, scale, green):
     np.testing.assert_allclose(sj.read_splats(path).albedo[0], [1, green, 0], atol=1e-6)
 
 
-def test_raw_points_are_completed_and_faces_without_radii_are_told(tmp_path):
-    path = tmp_path / "a.ply"
-    trimesh.creation.icosphere(radius=20.0).export(path)
-    with pytest.warns(UserWarning, match=r"a\.ply: has faces.*splatjax sample"):
-        splats = sj.read_splats(path)
+def test_raw_points_are_completed_and_a_mesh_is_not_points(tmp_path):
+    path, ball = tmp_path / "a.ply", trimesh.creation.icosphere(radius=20.0)
+    ball.export(path)
+    assert_refused(lambda: sj.read_splats(path), r"a\.ply: is a mesh.*splatjax sample")
+    trimesh.PointCloud(ball.vertices).export(path)
+    splats = sj.read_splats(path)
     outward = np.asarray(splats.centers) / 20
     assert (np.asarray(splats.normals) * outward).sum(axis=1).min() > 0.99
     np.testing.assert_allclose(np.asarray(splats.areas).sum(), 4 * np.pi * 400, rtol=0.01)
