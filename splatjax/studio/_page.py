@@ -35,6 +35,7 @@ from ._sliders import (
 
 _NEAR = 1e-5  # relative, of cameras that are the same
 _QUALITY = 92  # of JPEG
+_LEFT = 0.2  # share of the free width on the left of the picture; the controls are on the right
 
 
 class Page:
@@ -196,7 +197,7 @@ class Page:
         """Choose the pixel that was clicked, or none outside of the picture."""
         camera, (x, y) = self._session.camera(self._session.start), event.screen_pos
         width, height = _canvas(camera.width, camera.height, event.client)
-        column, row = int(x * width - (width - camera.width) // 2), int(y * height)
+        column, row = int(x * width - round(_LEFT * (width - camera.width))), int(y * height)
         is_inside = 0 <= column < camera.width and row < camera.height
         self._picked = (column, row) if is_inside else None
         self._pixel.content = f"pixel {column}, {row} ..." if is_inside else ""
@@ -213,9 +214,9 @@ class Page:
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
     def _send(self, client: Any) -> None:
-        """Show the picture in a window of any shape: centered, or in a tall window at the top."""
+        """Show the picture in a window of any shape, at the top and beside the controls."""
         size = _canvas(*self._image.size, client)
-        canvas = np.asarray(ImageOps.pad(self._image, size, centering=(0.5, 0.0)))
+        canvas = np.asarray(ImageOps.pad(self._image, size, centering=(_LEFT, 0.0)))
         client.scene.set_background_image(canvas, "jpeg", jpeg_quality=_QUALITY)
 
     def _show(self, image: np.ndarray) -> None:

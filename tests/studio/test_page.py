@@ -108,15 +108,15 @@ def test_a_browser_picks_drags_orbits_and_saves(page, tmp_path):
             wait_until(lambda: page._image.size == (SIDE, SIDE) and page._status.content == "")
             window.wait_for_timeout(3000)
             picture = Image.open(io.BytesIO(window.screenshot())).convert("RGB")
-            middle = picture.crop((200, 0, 700, 500)).resize((SIDE, SIDE), Image.Resampling.BOX)
+            middle = picture.crop((80, 0, 580, 500)).resize((SIDE, SIDE), Image.Resampling.BOX)
             seen, made = (np.asarray(each, float) for each in (middle, page._image))
-            shown = np.abs(seen - made)[:, 11:34]  # between a note of viser and the panel
+            shown = np.abs(seen - made)[:, 23:45]  # between a note of viser and the panel
             assert shown.mean() < SHOWN
 
         window.goto(page.url)
         window.wait_for_selector("text=turn lights")
         shows_the_picture()
-        window.mouse.click(450, 200)
+        window.mouse.click(335, 200)
         wait_until(lambda: "| radiance |" in page._pixel.content)
         assert page._pixel.content.startswith("| pixel 24, 19 | red | green | blue |")
         of_medium = (f"{name}, by powers of 2" for name in ("absorption", "scattering"))
