@@ -29,8 +29,8 @@ from ._neighbors import Boxes, Neighbors, find_neighbors
 # Quantile of the areas of the splats: a layer is resolved as far as splats of that area resolve it.
 FINE_QUANTILE = 0.01
 _CELL = 0.6  # edge of the cells, in standard deviations, for an error of 2e-3; error ~ edge^3
-_LAYERS = 2  # to a multiple of which they are filled up, so that materials share a program
-_WORTHWHILE = 1.2  # edge of the cells, in spacings, from which on merging splats pays
+_LAYERS = 2  # the number of layers is padded to a multiple of this, to share programs
+_WORTHWHILE = 1.2  # least edge of a cell, in spacings, for which splats are merged
 
 
 class ClusterDiffuser(AbstractDiffuser):
@@ -100,7 +100,7 @@ class ClusterDiffuser(AbstractDiffuser):
         **Arguments:**
 
         - `spacing`: root of the mean area of the splats, mm.
-        - `fine`: area that only `FINE_QUANTILE` of the splats are finer than, mm^2.
+        - `fine`: the `FINE_QUANTILE` quantile of the splats' areas, mm^2.
 
         **Returns:** for each layer its Gaussian, the variance (mm^2), the edge of its cells (mm; 0
         for single splats), and the support (standard deviations).

@@ -17,12 +17,12 @@ from ._diffuser import Sources
 
 POINTS_PER_BLOCK = 32  # blocks, and their halves and quarters, are compact
 SOURCES_PER_BLOCK = 8
-_TOGETHER = 128 * POINTS_PER_BLOCK  # split side by side from here on
+_TOGETHER = 128 * POINTS_PER_BLOCK  # size of parts that are then halved together
 
 
 class SunkSources(eqx.Module):
-    """The sources of all layers: means over their splats below the surface, weighted by area, and
-    sums of the areas, 0 without splats.
+    """The sources of all layers: area-weighted means over their splats below the surface, and the
+    total areas, 0 without splats.
     """
 
     centers: Float[Array, "3 sources"]
@@ -101,7 +101,7 @@ class LayerSources(eqx.Module):
             both = zip(totals, rows, strict=True)
             return [total.at[parents].add(row, mode="drop") for total, row in both], None
 
-        # Layer by layer: a sum over all of them at once is computed from a copy of every row.
+        # Sum layer by layer: a sum over all layers at once would copy every row.
         start = list(jnp.zeros((4 + len(splats.irradiance), self.count), splats.areas.dtype))
         light = splats.irradiance.swapaxes(0, 1) if own_light else None
         (areas, *rows), _ = jax.lax.scan(add_layer, start, (self.parents, depths, light))

@@ -21,7 +21,7 @@ from ._diffuser import (
 )
 from ._kernel import AbstractDiffusionKernel
 
-_AT_ONCE = 64  # points
+_AT_ONCE = 64  # points evaluated together
 
 
 class DenseDiffuser(AbstractDiffuser):

@@ -17,7 +17,7 @@ from splatjax.scene import Material, Scene, Splats
 
 from ._kernel import AbstractDiffusionKernel
 
-_WIDE = 1e12  # mm^2: resolved everywhere
+_WIDE = 1e12  # variance of a layer that all splats resolve, mm^2
 
 
 class Sources(eqx.Module):
@@ -69,9 +69,9 @@ class LayerValues(eqx.Module):
 
     **Attributes:**
 
-    - `values`: for each channel the weighted mean of the irradiance nearby, which keeps constants,
-      is between the least and the greatest irradiance, and is linear in it; last the mass of the
-      kernel on the surface, 1 on a flat sheet. Or the radiant exitance of each channel alone.
+    - `values`: for each channel the weighted mean of the nearby irradiance, which preserves
+      constants, lies between the least and the greatest irradiance, and is linear in it; last, the
+      kernel's mass on the surface, 1 on a flat sheet. Or only the radiant exitance per channel.
     - `slopes`: the slopes of the values in space, 1/mm.
     """
 
@@ -97,8 +97,8 @@ class AbstractDiffusionPlan(eqx.Module):
 
     **Attributes:**
 
-    - `gaussians`: the Gaussian of each evaluated layer; their number for a padding layer. The
-      others are too narrow for nearly all splats.
+    - `gaussians`: the Gaussian of each evaluated layer; for a padding layer, the number of
+      Gaussians. Omitted Gaussians are too narrow for nearly all splats.
     - `forward_mode`: for a diffuser without derivatives in both modes, whether the layers are
       differentiable in forward mode instead of reverse mode. Static.
     - `separate`: whether there is a layer for each Gaussian, or one with the radiant exitance.
@@ -191,9 +191,9 @@ class AbstractDiffusionPlan(eqx.Module):
         solved: PyTree,
         at: Int[Array, " points"],
     ) -> LayerValues:
-        """Return the layers as an eye sees them: unchanged where light leaves evenly.
+        """Return the layers as seen by an eye; unchanged if light leaves equally in all directions.
 
-        **Arguments:** all splats, and from `light` the layers at `at` and what was solved.
+        **Arguments:** all splats, and the layers at `at` and the solution returned by `light`.
         """
         return layers
 
@@ -272,8 +272,8 @@ def layer_values(
 
     - `sums`: of light in each channel, and last of mass: `sum_j m_j w_j (1, q_j)`, the places
       `q_j` of the sources counted from one origin with `points`.
-    - `per_mm`: from the unit of the places to that of the slopes.
-    - `per_flat`: from the mass to that over a flat sheet's.
+    - `per_mm`: the factor from the unit of the places to the unit of the slopes.
+    - `per_flat`: the factor from the mass to the mass relative to a flat sheet.
     """
     total, first_moments = jax.lax.split(sums, (1, 3), axis=sums.ndim - 2)
     # grad N = sum w E (q - x) / v, and grad (N / D) = (grad N - (N / D) grad D) / D.

@@ -19,12 +19,12 @@ from splatjax._precision import full_precision
 from ._kernel import TruncatedGaussian
 from ._neighbors import Lanes, Lists
 
-FAR = -1e6  # from anything, in any unit in use here, yet with a square that float32 holds
+FAR = -1e6  # coordinate far from all points in every unit used, with a square finite in float32
 
 
 class SourceTable(eqx.Module):
-    """Sources in blocks, or those of each lane of a sweep: planes, since a compiler reads and
-    multiplies these faster than the rows of one array.
+    """Sources in blocks, or of each lane of a sweep, as one plane per component: compiled code
+    reads and multiplies planes faster than the rows of one array.
 
     **Attributes:**
 
@@ -91,9 +91,9 @@ class Targets(eqx.Module):
 
     **Attributes:**
 
-    - `ranks`: index of every point among them, in any order; for all others numbers beyond them, no
-      two equal.
-    - `count`: their number. Static.
+    - `ranks`: the index of each point among the targets, in any order; for other points, distinct
+      numbers from `count` on.
+    - `count`: the number of targets. Static.
     """
 
     ranks: Int[Array, "points_blocks block"]

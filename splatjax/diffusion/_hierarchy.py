@@ -18,8 +18,8 @@ from ._neighbors import in_rows
 SIZES = 1, *(SOURCES_PER_BLOCK << level for level in range(9))
 _AXES = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # of second moments
 _WIDTH = 128  # sources in a row
-_ROWS = 16  # at once
-_NONE = np.iinfo(np.int32).max // 2  # beyond all blocks
+_ROWS = 16  # rows evaluated together
+_NONE = np.iinfo(np.int32).max // 2  # index of an absent block, beyond all blocks
 
 
 class Interactions(eqx.Module):
@@ -167,8 +167,8 @@ class Clusters(eqx.Module):
 
     **Attributes:**
 
-    - `totals`: of the weights.
-    - `centers`: weighted.
+    - `totals`: sums of the weights.
+    - `centers`: weighted means of the splats' centers.
     - `moments`: half the second moments xx, yy, zz, xy, xz, yz about the center, over the totals.
     """
 

@@ -24,23 +24,23 @@ _ROOT = (
     -0.124996893065,
     0.999999743205,
 )
-_FADE = 0.5  # the last part of the exponent, over which the kernel fades to zero
-_LEAST_TRUNCATED, _MOST_TRUNCATED = 4e-5, 0.1  # of the power: 4.5 and 2.1 standard deviations
-_LEAST_SHARE = 1e-3  # of the diffusion integral in a layer that counts at all
-_UNEVEN = 0.05  # from which on splats count as scattered
-_SLACK = 1e-5
-_TINY_ENERGY = 1e-12  # below which an energy does not count
-_ROUNDING = 0.01  # of the mass of a flat sheet: the corner of the gain is rounded over this excess
-_BENDS = 0.05, 10.0  # between which the rate in a sphere is not of one of two simpler forms
-_LARGEST_DECAY = 3.0  # of a layer: the tiny weights that fits give to wider ones are not physical
-_SHALLOW = 0.25  # standard deviations: the depth of sources from which curvature can be inferred
-_SAMPLE = 64  # splats whose neighbors are measured to find how evenly all are spread
+_FADE = 0.5  # range of the exponent below its largest value in which the kernel fades to zero
+_LEAST_TRUNCATED, _MOST_TRUNCATED = 4e-5, 0.1  # cut-off power: 4.5, 2.1 standard deviations
+_LEAST_SHARE = 1e-3  # least share of the diffusion integral in a layer, for choosing its support
+_UNEVEN = 0.05  # least unevenness of fully scattered splats
+_SLACK = 1e-5  # rounding error of a total reflectance of 1
+_TINY_ENERGY = 1e-12  # least energy that counts, and lower bound of divisors
+_ROUNDING = 0.01  # excess over the mass of a flat sheet within which the gain's corner is rounded
+_BENDS = 0.05, 10.0  # range of curvature over rate outside which simpler formulas are used
+_LARGEST_DECAY = 3.0  # largest decay rate times layer width: wider layers of fits are not physical
+_SHALLOW = 0.25  # least source depth, in standard deviations, used to infer curvature
+_SAMPLE = 64  # splats whose nearest neighbors measure the unevenness
 
 
 class TruncatedGaussian(eqx.Module):
     """`exp(-exponent)`, faded linearly to zero in the last `_FADE` before the largest exponent.
 
-    Automatic differentiation does not see the derivative of a step; the fade has one. In float32
+    Automatic differentiation ignores the derivative of a step, but not of the fade. In float32
     the exponential is the eighth power of a polynomial, within 2e-6 and at half the time, and its
     derivative is that of the polynomial.
 
@@ -169,10 +169,10 @@ class EscapeNormalization(AbstractDiffusionKernel):
 
     so less is absorbed. In a sum of Gaussians with weights `w_k` and variances `v_k`, another rate
     in place of `kappa`, for the same scattering, multiplies each weight by `exp(v_k (kappa^2 -
-    rate^2) / 2)`. Of the fraction `W` of the light that leaves a flat surface it makes `W / (W + (1
-    - W) rate / kappa)`, if the reflectance is of the form `1 / (1 + c kappa)`, with a constant `c`.
-    Gaussians fitted to a flat surface lack the tail that this needs, so their growth gives only the
-    shares of the layers in that of the total:
+    rate^2) / 2)`. The fraction `W` of light that leaves a flat surface becomes `W / (W + (1 - W)
+    rate / kappa)`, if the reflectance has the form `1 / (1 + c kappa)`, with a constant `c`.
+    Gaussians fitted to a flat surface lack the tail that this needs, so their growth determines
+    only each layer's share of the total growth:
 
         gain_k = 1 + s (exp(v_k (kappa^2 - rate_k^2) / 2) - 1)
 

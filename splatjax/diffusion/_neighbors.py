@@ -15,8 +15,8 @@ from splatjax._chunking import with_spare
 
 BLOCKS_PER_ROW = 16  # blocks of sources in a row of a list
 LANES = 256  # blocks of points that are swept together
-_ROWS = 7  # for every block of points: more than most bodies need, so that they share a program
-_AT_ONCE = 1 << 13  # pairs of boxes whose parts are tested together: they stay in cache
+_ROWS = 7  # least rows per list, more than most bodies need, so that bodies share a program
+_AT_ONCE = 1 << 13  # pairs of boxes whose parts are tested together, few enough for the cache
 _FAN = 4  # parts of a box of a coarser level
 
 Corners = tuple[Float[np.ndarray, "_boxes 3"], Float[np.ndarray, "_boxes 3"]]
@@ -29,10 +29,10 @@ class Lists(eqx.Module):
 
     **Attributes:**
 
-    - `rows`: blocks of sources in rows of fixed length, padded by the number of blocks, whose block
-      is empty; so is the last row.
-    - `first`, `counts`: the rows of each list: one for every block of points, layer after layer.
-    - `order`: of the lists, the longest first.
+    - `rows`: indices of source blocks, in rows of fixed length; padding is the number of blocks,
+      the index of an empty block. The last row is all padding.
+    - `first`, `counts`: first row and number of rows of each list, per layer and block of points.
+    - `order`: the lists, longest first.
     """
 
     rows: Int[Array, "rows width"]
@@ -66,7 +66,7 @@ class Lists(eqx.Module):
 
 
 class Lanes(eqx.Module):
-    """Lists that are swept together; in lanes without one different numbers beyond all lists."""
+    """Lists that are swept together; empty lanes hold distinct numbers beyond all lists."""
 
     lists: Int[Array, " lanes"]
     first: Int[Array, " lanes"]
@@ -89,7 +89,7 @@ class Lanes(eqx.Module):
 
 
 class Boxes(eqx.Module):
-    """Boxes around blocks of points; an empty block's is inside out."""
+    """Boxes around blocks of points; the box of an empty block is inside out."""
 
     low: Float[Array, "blocks 3"]
     high: Float[Array, "blocks 3"]
@@ -122,8 +122,8 @@ class Neighbors(eqx.Module):
 
     **Attributes:**
 
-    - `layers`: of the blocks of sources.
-    - `reaches`: of the layers, mm.
+    - `layers`: the layer of each block of sources.
+    - `reaches`: the reach of each layer, mm.
     """
 
     lists: Lists
@@ -156,10 +156,10 @@ def find_neighbors(
 
     **Arguments:**
 
-    - `layers`: of the blocks of sources.
-    - `reaches`: of the layers, mm; nothing is in reach of a layer with 0.
-    - `parts`: equal parts of the points, each with separate lists, one after the other.
-    - `least`: rows of each part.
+    - `layers`: the layer of each block of sources.
+    - `reaches`: the reach of each layer, mm; with 0 a layer has no neighbors.
+    - `parts`: number of equal parts of the points, one after the other, with separate lists.
+    - `least`: least number of rows of each part.
     """
     low, high = sources.corners
     corners = (np.split(corner, parts) for corner in points.corners)

@@ -44,9 +44,9 @@ def continue_to_points(
 ) -> tuple[Float[Array, "*layers values points"], Float[Array, "*layers values points"] | None]:
     r"""Continue blended layers, and their derivatives, to points of the surface.
 
-    Each splat is continued along half its slope: the error of the full slope equals that of no
-    slope with the opposite sign, so the error is of third order in the spacing. The other half of
-    the mean slope, from the mean center, corrects for the uneven positions of splats around a
+    Each splat is continued along half its slope. The errors with the full slope and with no slope
+    are equal and opposite, so the remaining error is of third order in the spacing. The other half
+    of the mean slope, from the mean center, corrects for the uneven positions of splats around a
     point:
 
         L(x) = sum w_i (L_i + s_i (x - p_i) / 2) / W + (sum w_i s_i / W) (x - sum w_i p_i / W) / 2

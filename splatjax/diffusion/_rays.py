@@ -15,14 +15,14 @@ from splatjax.scene import Material
 from ._diffuser import Beams
 from ._surface_sums import GRAZING, ScreenedKernel, SurfaceSums, dot
 
-_DEPTHS = 6  # along each beam
+_DEPTHS = 6  # quadrature nodes along each beam
 _MILNE = 0.710446  # extrapolation distance of the Milne problem, mean free paths, times albedo
-_LEAST_ALBEDO = 0.1
+_LEAST_ALBEDO = 0.1  # lower bound of the albedo by which `z_e` is divided
 # Hopf's q(tau) = _MILNE - sum_i a_i exp(-b_i tau), within 0.0024.
 _HOPF = (0.08948, 2.11533), (0.04361, 16.63774)
-_COSINES = 8  # over which a law of angles is averaged
-_BRIGHTEST = 2.0  # times an even surface
-_LONGEST = 60.0  # ray, mean free paths
+_COSINES = 8  # quadrature nodes of the mean over the hemisphere
+_BRIGHTEST = 2.0  # largest radiance relative to a surface that radiates evenly
+_LONGEST = 60.0  # largest ray length used, mean free paths
 _ENDLESS = 1e9  # mm: the length of a ray without an end
 
 
@@ -156,10 +156,10 @@ class SurfaceLight(eqx.Module):
 
     **Attributes:**
 
-    - `fluence`: times `D / z_e`.
-    - `flux`: net, outward.
-    - `irradiance`: of the beam that enters, and `entering`, the cosine of it inside: 0 without one.
-    - `direction`: of the beam, mean over the channels.
+    - `fluence`: fluence times `D / z_e`.
+    - `flux`: net outward flux.
+    - `irradiance`, `entering`: irradiance of the entering beam, and its cosine inside; 0 without.
+    - `direction`: direction of the beam, averaged over the channels.
     """
 
     fluence: Float[Array, "channels splats"]
@@ -169,8 +169,8 @@ class SurfaceLight(eqx.Module):
     direction: Float[Array, "3 splats"]
 
     def at_exits(self, surface: SurfaceSums, way: Float[Array, "3 splats"]):
-        """Follow rays into the body: return the light at their ends, none where they do not end,
-        the cosine of the exit, and the length of the ray, mm, finite for its derivative.
+        """Follow rays into the body: return the light at their ends, 0 for a ray without an end;
+        the cosine of the exit; and the length of the ray, mm, finite for its derivative.
         """
         parts = jax.tree.leaves(self)
         rows = jnp.concatenate(parts)
@@ -187,8 +187,8 @@ class SolvedLight(eqx.Module):
     **Attributes:** along the splats
 
     - `exitance`: radiant exitance.
-    - `slopes`: of it along the surface, 1/mm.
-    - `surface`: the light there.
+    - `slopes`: slopes of the radiant exitance along the surface, 1/mm.
+    - `surface`: the light at the surface.
     - `mean`: the mean of `source_integral` over the hemisphere, by its cosine.
     """
 

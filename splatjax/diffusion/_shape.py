@@ -25,11 +25,11 @@ from ._hierarchy import Hierarchy, padded_count
 from ._rays import DiffusionCoefficients, SolvedLight, radiance_towards, scattered_once
 from ._surface_sums import SOFTENED, ScreenedKernel, SurfaceSums
 
-_SOFTENING = 2**-0.25  # length over the spacing
-_FINER = 2**-0.5  # softening of the sources, over that on the surface
-_LEAST_KAPPA = 1e-3  # over the root of the area
+_SOFTENING = 2**-0.25  # softening length over the spacing
+_FINER = 2**-0.5  # softening length of the sources over the length on the surface
+_LEAST_KAPPA = 1e-3  # least kappa, times the root of the area
 _OPEN = 0.05  # sum of the normals, by area, over the area: an open neck leaves 0.08
-_MOST = 24  # products of the solver
+_MOST = 24  # largest number of matrix products of the solver
 
 
 class ShapeDiffuser(AbstractDiffuser):

@@ -16,10 +16,10 @@ from ._hierarchy import Clusters, Hierarchy, cluster_totals, padded_count
 
 GRAZING = 1e-3  # cosine
 _OVERLAP = 1.5  # radius of a splat over the root of its area
-_TERMS, _SMALL = 8, 0.1  # of the series of the softening near 0
-_NODES, _REACH = 12, 4.0  # of the integral of what is left out, and its end in softening lengths
+_TERMS, _SMALL = 8, 0.1  # highest order of the softening's series near 0, and where it is used
+_NODES, _REACH = 12, 4.0  # of the integral of the removed part: nodes, and end in softening lengths
 _SCALE = 2 / math.sqrt(math.pi)
-SOFTENED = 3.0  # softening lengths, beyond which the kernel is as without
+SOFTENED = 3.0  # softening lengths beyond which the kernel is not softened
 
 
 class ScreenedKernel(eqx.Module):

@@ -1,5 +1,5 @@
-"""Pictures for any weights, or for any distant light: the part that does not depend on these is
-rendered once.
+"""Pictures for any weights or any distant light, by rendering once the part that is independent of
+them.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from ._surface import ShadedSurface, in_a_row
 class DiffusionBasis(eqx.Module):
     r"""A picture as a function of the weights.
 
-    Its points are the visible ones: of the surface in front, and of the surface behind its
+    The points are the visible points of the front surface and of the surface behind it at
     silhouettes.
 
     **Attributes:**
@@ -67,7 +67,7 @@ class DiffusionBasis(eqx.Module):
         return diffuse.T.reshape(height, width, channels) + self.specular
 
     def of_points(self, chosen: Int[np.ndarray, " chosen"]) -> "DiffusionBasis":
-        """Return the part of some points. Most points of a new basis are in no pixel."""
+        """Select some of the points. Most points of a new basis are in no pixel."""
         return eqx.tree_at(
             lambda basis: (
                 *jax.tree.leaves([getattr(basis.light, name) for name in basis.light.ALONG_POINTS]),
@@ -225,7 +225,7 @@ def relighting_basis(
 
     **Arguments:** as for `render`.
 
-    - `scene`: its only light is a `HarmonicLight`; only the number of its coefficients matters.
+    - `scene`: has one light, a `HarmonicLight`; only its number of coefficients matters.
     - `light`: from `splatjax.transfer` with the same scene, settings and plan.
 
     **Returns:** a `RelightingBasis`; NaN where the plan does not suffice.

@@ -12,24 +12,24 @@ from splatjax._memory import check_memory
 from splatjax._records import check_class, is_traced
 from splatjax.scene import Camera, DiskLight, RectangleLight, Scene, Splats, lights_by_kind
 
-# Lower bounds: a picture that needs more than the free memory by these does not fit.
+# Lower bounds of a picture's memory: if they exceed the free memory, the picture does not fit.
 BYTES_PER_SPLAT, BYTES_PER_PIXEL = 1000.0, 500.0
-_SAMPLE = 4096  # evenly chosen splats, from which the shape of a body is estimated
-# Sum of the normals of a closed body, by area, as a fraction of the area. An open neck leaves
-# 0.08, a hemisphere 0.5.
+_SAMPLE = 4096  # largest number of splats, evenly chosen, used to estimate a body's shape
+# Largest area-weighted normal sum of a closed body, divided by its area. The sum is 0.08 for an
+# open neck and 0.5 for a hemisphere.
 _CLOSED = 0.15
 _SOLID = 0.05  # least volume of a body (not a sheet), over that of a sphere of its area
-# Millimeters below which a material is opaque on purpose, as by `Material.opaque`.
+# Scattering distance, mm, up to which a material is intentionally opaque (`Material.opaque`).
 _OPAQUE = 2e-3
-# Size of a body over the distance that light travels below its surface.
+# Largest plausible body size, divided by the distance that light travels below the surface.
 _RATIO = 1000.0
 
 
 def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
     r"""Raise an error if channels disagree or memory does not suffice, and warn of likely causes
-    of black or meaningless pictures: no light, inverted normals, a camera inside the body, a body
-    that is smaller than the distance that light travels in it or a thousand times larger, and a
-    light that faces away from the body.
+    of black or meaningless pictures: no light, inverted normals, a camera inside the body, a light
+    that faces away from the body, and a body smaller than the distance that light travels in it,
+    or a thousand times larger.
 
     For traced scenes, and scenes distributed over several processes, only the channels are checked.
     Each warning is shown once.
@@ -102,7 +102,7 @@ def _device_memory(splats: Splats) -> float | None:
 
 
 def _warnings(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
-    """List what may be unintended in a scene."""
+    """Yield a warning for each likely mistake in a scene."""
     # A light without a field for its strength counts as one.
     strengths = [np.asarray(getattr(light, light.strength_field, 1.0)) for light in scene.lights]
     if is_lit and not any(map(np.any, strengths)):
@@ -173,8 +173,8 @@ def in_one_dtype(scene: Scene, *trees):
 
 
 def check_channels(scene: Scene) -> None:
-    """Raise `ValueError` unless albedo and lights have the material's channels, and the factors on
-    its weights its Gaussians, and no single scattering beside them.
+    """Raise `ValueError` unless albedo and lights match the material's channels, and the weight
+    factors match its Gaussians and are used without single scattering.
     """
     gaussians, channels = scene.material.gaussians.weights.shape
     counts, factors = {}, scene.splats.weights

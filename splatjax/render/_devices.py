@@ -1,5 +1,5 @@
-"""Distribution of the passes: on one device, or with splats or pictures divided over the devices of
-a mesh; and padding of scenes, so that many share a program.
+"""Run the passes on one device, or divide splats or pictures over the devices of a mesh; and pad
+scenes so that many share a compiled program.
 """
 
 import dataclasses
@@ -52,7 +52,7 @@ def pad_scene(
     scene: Scene, plan: Plan, light: Kept | None = None, *trees: PyTree
 ) -> tuple[Scene, Plan, Kept | None, OwnRows]:
     """Pad the splats of a scene to the length of its plan, the lights of each kind to four or a
-    larger power of two, the Gaussians and the angles. NumPy and `device_put` do this, which compile
+    larger power of two, the Gaussians and the angles. NumPy and `device_put` are used, to compile
     nothing. If the scene or `trees` is traced, or splats are divided over devices, nothing changes.
 
     The plan's order has no entry for a padding splat. A padding light has no strength and no shadow
@@ -61,7 +61,7 @@ def pad_scene(
 
     **Arguments:**
 
-    - `light`: a precomputed result of the scene, padded like its lights.
+    - `light`: a precomputed result for the scene; it is padded like the scene's lights.
 
     **Returns:** the scene with its lights sorted by kind, its plan, the precomputed result, and the
     indices of its own lights and Gaussians.
@@ -120,7 +120,7 @@ def _pad_lights(
 def rows_or_last(
     rows: Shaped[Array, "rows ..."], places: Int[np.ndarray, " places"]
 ) -> Shaped[Array, "places ..."]:
-    """Take rows, the last one for indices beyond them. Outside `jit` nothing is compiled."""
+    """Take rows; indices past the end take the last row. Compile nothing outside `jit`."""
     if np.array_equal(places, np.arange(len(rows))):
         return rows
     if is_traced(rows):
@@ -162,17 +162,17 @@ def on_devices(
     placed: PyTree = None,
     by_splat: bool = False,
 ) -> Result:
-    """Run a function on the devices of a plan, each with its own splats in the order of the plan;
-    all in the precision of the splats' centers. Gradients are on the devices of the splats.
+    """Run a function on every device of a plan, with the splats of that device in the plan's order
+    and in the precision of their centers. Gradients stay on the devices of the splats.
 
     **Arguments:**
 
-    - `function`: of the passes of a device, then of `replicated`, `rows` and, if given, `placed`.
+    - `function`: takes the device's passes, then `replicated`, `rows` and, if given, `placed`.
     - `replicated`: the same on every device.
     - `rows`: one row per splat, in the order of the scene.
-    - `placed`: results of an earlier call along the splats, in the order of the plan.
-    - `by_splat`: the results are along the splats, in the order of the plan; otherwise they are the
-      same on all devices.
+    - `placed`: results of an earlier call, one entry per splat in the order of the plan.
+    - `by_splat`: whether results have one entry per splat, in the order of the plan; otherwise
+      they are the same on all devices.
     """
     scene, replicated, rows = in_one_dtype(scene, replicated, rows)
     devices, per_device = splats_per_device(scene.splats.count, plan.mesh)

@@ -23,7 +23,7 @@ from splatjax.scene import (
 )
 
 _GRAZING = 1e-3  # cosine
-_NEARLY = 1.05  # bounding radii, from which on one frustum around all splats fits
+_NEARLY = 1.05  # least light distance, in bounding radii, for one frustum around all splats
 
 
 class ShadowPlan(eqx.Module):
@@ -31,8 +31,8 @@ class ShadowPlan(eqx.Module):
 
     **Attributes:**
 
-    - `raster`: their capacity.
-    - `settings`: settings of the maps and their comparison.
+    - `raster`: the capacity of the maps.
+    - `settings`: settings of the maps and of the comparison with them.
     - `cube`: whether the maps are the six faces of a cube, for a point light among the splats.
       Static.
     - `splats_per_disc`: how many splats are merged into each disc in the maps. Static.
@@ -47,8 +47,8 @@ class ShadowPlan(eqx.Module):
     lights: Int[Array, ""] | None = None
 
     def closeness(self, light: AbstractLightSample, bounds: _splatting.Bounds) -> Float[Array, ""]:
-        """Divide the radius of the splats' bounding sphere by the distance of a point light from
-        its center. Above 1, a light that was planned outside of the sphere is now inside.
+        """Divide the radius of the splats' bounding sphere by a point light's distance from its
+        center. Above 1, a light that was outside the sphere when planned is now inside.
         """
         if self.cube or not isinstance(light, AbstractPointSample):
             return jnp.zeros_like(bounds.radius)
@@ -61,8 +61,8 @@ def plan_views(
     bounds: _splatting.Bounds,
     settings: _splatting.ShadowSettings,
 ) -> tuple[list[Sequence[_splatting.AbstractView]], bool]:
-    """Return the views of the shadow maps of each light of a group, and whether they are faces of
-    cubes: all are if one light is among the splats, or near them. Not for traced arrays.
+    """Return the shadow-map views of each light of a group, and whether these are cube faces: all
+    are, if any light is among or near the splats. Not for traced arrays.
     """
     cube = any(
         float(jnp.linalg.norm(light.position - bounds.center)) < _NEARLY * float(bounds.radius)
@@ -123,8 +123,8 @@ class LightVisibility(eqx.Module):
     def per_light(
         self, positions: Float[Array, "points 3"], normals: Float[Array, "points 3"]
     ) -> tuple[Float[Array, "_lights points"] | None, ...]:
-        """Average the visibility of each light's samples, weighted by their unshadowed light; if
-        all samples are below the horizon, as if all grazed the surface.
+        """Average the visibility of each light's samples, weighted by their unshadowed light.
+        Samples below the horizon count as grazing.
         """
 
         def received(light):
@@ -208,7 +208,7 @@ def map_visibility(
     settings: _splatting.ShadowSettings,
     cube: bool,
 ) -> Float[Array, " splats"]:
-    """Look the splats up in one map: 0 for those that belong to another face of a cube."""
+    """Compute the splats' visibility from one map; 0 for splats of another cube face."""
     visibility = _splatting.compute_visibility(scene.splats, shadow_map, settings)
     if cube:
         assert isinstance(shadow_map.view, _splatting.PerspectiveView)

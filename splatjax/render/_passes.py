@@ -78,8 +78,8 @@ class Passes(eqx.Module):
 
     **Attributes:**
 
-    - `scene`: its splats in the order of the plan.
-    - `combination`: of the partial results of all devices.
+    - `scene`: the scene, with its splats in the order of the plan.
+    - `combination`: combines the partial results of all devices.
     """
 
     scene: Scene
@@ -195,7 +195,7 @@ class Passes(eqx.Module):
 
         start = jnp.zeros_like(direct.entering), none
         (bounced, needed), _ = jax.lax.scan(bounce, start, None, length=self.settings.bounces)
-        # Without albedo its root is one.
+        # The root of a missing albedo is one.
         entering = direct.entering + bounced
         return Irradiance(entering, entering * root), bounced * root, beams, needed
 
@@ -214,8 +214,8 @@ class Passes(eqx.Module):
         - `read`: computes the results of a picture from shaded points, pointwise along the last
           axis.
 
-        **Returns:** the results for each place, and the places, with the capacity that all passes
-        needed.
+        **Returns:** the results of each place, and the visible surfaces, whose `needed` covers all
+        passes.
         """
         scene, settings, plan = self.scene, self.settings, self.plan
         view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
@@ -283,10 +283,10 @@ def sample_surfaces(
 
     **Arguments:**
 
-    - `visible`: of all places.
+    - `visible`: the visible surfaces of all places.
     - `like`: the attributes whose rows were summed.
-    - `origin`: of the splats' centers among the attributes.
-    - `sums`, `tiles`: those of `visible`, of these places.
+    - `origin`: the origin of the splats' centers among the attributes.
+    - `sums`, `tiles`: the entries of `visible` for these places.
     """
     surface = _splatting.Surface.of(sums, visible.view, visible.needed)
 

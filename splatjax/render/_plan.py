@@ -33,7 +33,7 @@ from ._settings import RenderSettings
 
 # Directions on the whole sphere, for which the shadow maps of any environment are planned.
 _DIRECTIONS = [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z]
-_MOST_SPLATS = 1.06  # largest ratio of an earlier count, to which a scene is padded, to its own
+_MOST_SPLATS = 1.06  # largest padded splat count over a scene's own count, to reuse a program
 
 
 class Plan(eqx.Module):
@@ -47,7 +47,7 @@ class Plan(eqx.Module):
 
     - `order`: the compact order in which the splats of each device are rendered; the last one is
       repeated to complete a block.
-    - `exists`: false for these repetitions.
+    - `exists`: false for the repeated splats.
     - `shadows`: the capacity of the shadow maps of each group of lights of a kind; `None` for
       lights without shadows.
     - `diffusion`: the clusters and neighbors of the splats.

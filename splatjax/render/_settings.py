@@ -1,4 +1,4 @@
-"""How each pass works, and where the light enters: at the splats, unless a subclass decides."""
+"""Settings of each pass, and where irradiance is computed: at the splats, by default."""
 
 import abc
 
@@ -25,8 +25,8 @@ from ._surface import SurfaceAttributes, SurfaceSamples
 
 
 class AbstractLighting(eqx.Module):
-    """The attributes that splats bring into the picture, and their use at the pixels before
-    shading.
+    """Which splat attributes are blended, and how the blended attributes are used at the pixels
+    before shading.
     """
 
     def attributes(

@@ -1,4 +1,4 @@
-"""Statistics of all splats of a stream, which a picture needs first."""
+"""Statistics of all splats of a stream, computed before a picture is rendered."""
 
 import math
 from collections.abc import Iterator
@@ -16,8 +16,8 @@ _CHANGED = "parts must return the same splats in the same order at each call"
 
 
 class ReplayableStream:
-    """Parts that must be the same at each iteration, because results of one iteration serve the
-    next.
+    """Parts that must be the same at each iteration, because an iteration uses results of the one
+    before.
     """
 
     def __init__(self, parts: Parts):
@@ -26,8 +26,8 @@ class ReplayableStream:
     def __call__(self) -> Iterator[Splats]:
         """Iterate over all splats from the beginning.
 
-        **Raises:** `ValueError` if a part differs from the first iteration, or there are fewer or
-        more.
+        **Raises:** `ValueError` if a part, or the number of parts, differs from the first
+        iteration.
         """
         marks = []
         for i, part in enumerate(self.parts()):
@@ -53,11 +53,11 @@ class StreamStatistics:
     **Attributes:**
 
     - `part_size`: splats in every part but the last.
-    - `middle`, `reach`: the middle of the box around all centers, and the distance to the farthest
-      rim.
-    - `spacing`, `fine`: the root of the mean area, and the first percentile of the area, of the
-      splats that have one; infinite if none has.
-    - `discs`: the sum of the squared radii of these splats over that of their areas.
+    - `middle`, `reach`: the middle of the box around all centers, and an upper bound of the
+      distance to the farthest rim.
+    - `spacing`, `fine`: the root of the mean area, and the first percentile of the area, of splats
+      with a nonzero area; infinite without such splats.
+    - `discs`: the sum of these splats' squared radii divided by the sum of their areas.
     - `unevenness`: the mean of the unevenness of the parts, weighted by their splats.
     """
 

@@ -16,8 +16,8 @@ from splatjax.scene import Frame, Scene, StackedLights
 
 
 class SurfaceAttributes(eqx.Module):
-    """Rows that passes 2 and 3 blend (Eq. 1), along the last axis of every array: of the splats, or
-    of the visible points.
+    """Attributes that passes 2 and 3 blend (Eq. 1). The last axis of every array runs along the
+    splats, or along the visible points.
 
     **Attributes:**
 
@@ -96,14 +96,14 @@ def split_rows(stacked: Float[Array, "all points"], like: PyTree) -> PyTree:
 
 
 class ShadedSurface(eqx.Module):
-    """The surface samples, shaded; nothing is premultiplied.
+    """The shaded surface samples, not premultiplied by coverage.
 
     **Attributes:**
 
-    - `radiance_per_exitance`: towards the eye, `sqrt(albedo) exit_transmission / pi`; 0 without a
+    - `radiance_per_exitance`: `sqrt(albedo) exit_transmission / pi`, towards the eye; 0 without a
       surface.
-    - `layers`: of each Gaussian, times `radiance_per_exitance`.
-    - `diffuse`: their weighted sum.
+    - `layers`: the layer of each Gaussian, times `radiance_per_exitance`.
+    - `diffuse`: the weighted sum of the layers.
     - `resolved`: the fraction of each layer that is the diffusion integral.
     """
 

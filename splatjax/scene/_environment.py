@@ -18,9 +18,9 @@ from ._scene import Camera, Frame
 
 _CELLS = 128  # along a side of the grid of equal areas that is cut into strata; a power of two
 _EVEN = 0.1  # fraction of uniform importance, so that no direction is far from a sample
-_FAINT = 1e-3  # of the mean radiance, added where the mean direction of a stratum is computed
-_ROWS = 64  # height of a blurred map, whose pixels have the width of the sharpest lobe
-_ROUGHNESSES = np.geomspace(0.05, 1.0, 7)  # of the blurred maps
+_FAINT = 1e-3  # fraction of the mean radiance added in computing a stratum's mean direction
+_ROWS = 64  # height of a blurred map; a pixel is as wide as the sharpest lobe
+_ROUGHNESSES = np.geomspace(0.05, 1.0, 7)  # roughnesses of the blurred maps
 
 
 @record

@@ -21,7 +21,7 @@ from ._environment import (
 )
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, DistantStratum
 
-_ROWS = 64  # of the map that is mirrored
+_ROWS = 64  # height of the map used for highlights
 # Softboxes: azimuth and elevation in degrees, half of width and height over distance, radiance.
 _SOFTBOXES = (
     (-30.0, 35.0, 0.5, 0.6, (3.9, 3.65, 3.3)),
@@ -29,7 +29,7 @@ _SOFTBOXES = (
     (150.0, 25.0, 0.25, 0.9, (7.0, 7.4, 8.0)),
 )
 _ZENITH, _HORIZON, _SUN = (0.12, 0.22, 0.48), (0.45, 0.5, 0.55), (2.4, 2.2, 1.9)
-_CONCENTRATION = 1500.0  # of the sun, whose light is spread over some 3 degrees
+_CONCENTRATION = 1500.0  # concentration of the sun's light, spread over about 3 degrees
 
 
 @record

@@ -43,8 +43,8 @@ def lights_by_kind(
     lights: tuple[AbstractLight, ...],
 ) -> list[list[tuple[int, AbstractLightSample]]]:
     """List the samples of each kind of lights, each with the index of its light. Lights with one
-    highlight for all samples are listed separately. Kinds are sorted, so that the order of lights
-    needs no program of its own.
+    highlight for all samples are listed separately. Kinds are sorted, so that scenes whose lights
+    differ only in order share a program.
     """
     kinds: dict[object, list[tuple[int, AbstractLightSample]]] = {}
     for index, light in enumerate(lights):

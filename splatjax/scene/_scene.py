@@ -281,8 +281,8 @@ class Frame(eqx.Module):
     single_scattering: Float[Array, "height width channels"] | None = None
 
     def _repr_png_(self) -> bytes | None:
-        """Return what a notebook shows: the picture as `splatjax.write_png` writes it; `None` for a
-        batch, and for channels that no display has.
+        """Encode the picture for a notebook like `splatjax.write_png`; `None` for a batch, and for
+        numbers of channels that cannot be displayed.
         """
         if self.beauty.ndim != 3 or self.beauty.shape[-1] not in (1, 3):
             return None

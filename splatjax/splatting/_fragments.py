@@ -32,9 +32,9 @@ class Lanes(eqx.Module):
 
     **Attributes:**
 
-    - `tiles`: the number of tiles for an empty lane.
-    - `blocks`: of the longest of their lists.
-    - `x`, `y`: corners, pixels.
+    - `tiles`: the tile of each lane; the number of tiles for an empty lane.
+    - `blocks`: number of blocks of the longest list.
+    - `x`, `y`: corners of the tiles, pixels.
     """
 
     tiles: Int[Array, " lanes"]
@@ -112,8 +112,8 @@ class Sweep(eqx.Module):
         return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._no_limit(lanes))
 
     def limits_behind(self, listed: "Listed", lanes: Lanes, open_limit):
-        """Find the same behind the front, whose far limit is `open_limit` in open pixels and -inf
-        in others: for the fragments of sufficient weight, and for all.
+        """Find the far limits behind the front, for fragments of sufficient weight and for all. The
+        far limit of the front is `open_limit` in open pixels; in others `open_limit` is -inf.
         """
 
         def nearest(block, limits):
@@ -269,8 +269,8 @@ def _number_cotangents(splats, quad, near):
 def second_limits(
     weighty: Float[Array, "places pixels"], of_any: Float[Array, "places pixels"]
 ) -> Float[Array, "places pixels"]:
-    """Choose the end of the surface behind, from the largest of both over all parts; inf where
-    there is none.
+    """Choose the end of the surface behind from the two largest limits over all parts; inf without
+    a surface.
     """
     limits = jnp.where(weighty > -jnp.inf, weighty, of_any)
     return jnp.where(limits > -jnp.inf, limits, jnp.inf)

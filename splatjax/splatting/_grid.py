@@ -8,7 +8,7 @@ from splatjax._chunking import divided
 
 TILE_SIDE = 8  # pixels
 _HALF = 128
-TILE_BITS = 22  # in a sort key of 32, for the number of a tile
+TILE_BITS = 22  # bits for the number of a tile, in a sort key of 32 bits
 
 
 class TileGrid(eqx.Module):

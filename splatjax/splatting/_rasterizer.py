@@ -196,7 +196,7 @@ class AbstractRasterPlan(eqx.Module):
 
 
 class AbstractRasterizer(eqx.Module):
-    """An implementation of passes 2 and 3; a setting."""
+    """An implementation of passes 2 and 3, and of the depths of pass 1; a setting."""
 
     @abc.abstractmethod
     def make_plan(

@@ -38,7 +38,8 @@ class ShadowSettings(eqx.Module):
       one of two sizes per octave, and is at least 64. `inf` for the full resolution.
     - `bias`: a surface less than this distance behind the surface of the map is fully lit, so that
       a surface does not shadow itself. The unit is the reach of the splat in the map: the root of
-      the sum of the squares of its radius and of a pixel's diagonal.
+      the sum of the squares of its radius (of the merged splat, if splats are merged) and of a
+      pixel's diagonal.
     - `softness`: the number of further reaches over which the light fades, so that shadows have
       gradients with respect to depth. Across the edge of a shadow, light fades over about two
       pixels of the map.

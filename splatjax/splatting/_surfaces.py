@@ -22,8 +22,8 @@ from ._rasterizer import (
 )
 from ._views import CLOSED, AbstractView, SplattingSettings
 
-TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2  # of a chunk, for what is computed chunk by chunk
-_BESIDE = 2  # pixels from an open one: as far as outlines are filtered
+TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2  # tiles in a chunk of values computed chunk by chunk
+_BESIDE = 2  # pixels; a pixel this near an open one is beside the background
 
 
 def blend_fragments(
@@ -48,10 +48,10 @@ def coverages(
 ) -> tuple[Float[Array, "tiles pixels"], Float[Array, "tiles pixels"]]:
     r"""Compute the fraction of each pixel that the front surface covers, and the one behind it.
 
-    Each covers a smooth step of the sum of its weights, the one behind of the part that the front
-    leaves. Beside the background, which is within two pixels of one that both leave open, the step
+    Coverage is a smooth step of the sum of weights; the surface behind covers this fraction of the
+    part that the front leaves open. Within two pixels of a pixel that both leave open, the step
     ends at `full`, so that outlines are where the body ends. Elsewhere it ends at a sum that
-    surfaces keep in creases, and between splats scattered at random: nothing shines through there.
+    surfaces reach even in creases and between randomly scattered splats, so nothing shines through.
 
     **Arguments:** `front`, `behind`: sums of weights. Differentiable.
     """

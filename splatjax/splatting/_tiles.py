@@ -29,8 +29,8 @@ from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, S
 from ._sweeps import PartSweep, sum_tile_fragments
 from ._views import AbstractView, SplattingSettings
 
-_STEP = 1024  # of the planned number of splats
-_SPARE = 1.5  # times the tiles with a surface behind that planning found
+_STEP = 1024  # least step to which the planned number of splats is rounded up
+_SPARE = 1.5  # planned tiles with a surface behind, over the number found by planning
 
 
 class TileRasterizer(AbstractRasterizer):
@@ -38,7 +38,7 @@ class TileRasterizer(AbstractRasterizer):
 
     **Attributes:** (static)
 
-    - `lanes`, `slots`: tiles swept together, and splats of each swept together.
+    - `lanes`, `slots`: number of tiles swept together, and of splats of each tile.
     - `spare`: factor on the needed capacity.
     """
 
@@ -101,7 +101,7 @@ class TilePlan(AbstractRasterPlan):
 
     **Attributes:** (static)
 
-    - `rasterizer`: its setting.
+    - `rasterizer`: the rasterizer that made the plan.
     - `splats`: number of splats that may be visible.
     - `bins`: capacity of the lists.
     - `places`: capacity for the tiles with a surface.
@@ -159,8 +159,8 @@ class TilePlan(AbstractRasterPlan):
         view: AbstractView,
         settings: SplattingSettings,
     ) -> PartSweep:
-        """Prepare the stages of the sweep for those of one of several parts of the splats that the
-        view may see.
+        """Prepare the stages of the sweep for the splats of one of several parts that the view may
+        see.
         """
         chosen, _ = self.choose(splats, view)
         seen = splats.take(chosen), take_points(attributes, chosen)
