@@ -14,14 +14,14 @@ class BlurSums(eqx.Module):
     """The weighted sums of a blur at each pixel."""
 
     sums: Float[Array, "rows height width"]
-    """Of what was trusted, weighted."""
+    """Weighted sums of trusted values."""
     trusted: Float[Array, "height width"]
-    """Weight of what was trusted."""
+    """Weight of trusted taps."""
     total: Float[Array, "height width"]
     """Weight of all taps."""
 
     def renormalized(self) -> Float[Array, "rows height width"]:
-        """Compute the mean over what was trusted; 0 where nothing was."""
+        """Compute the mean over trusted taps; 0 where there are none."""
         is_trusted = self.trusted > 0
         return jnp.where(
             is_trusted[None], self.sums / jnp.where(is_trusted, self.trusted, 1.0)[None], 0.0
@@ -30,7 +30,7 @@ class BlurSums(eqx.Module):
     def filled(
         self, values: Float[Array, "rows height width"]
     ) -> Float[Array, "rows height width"]:
-        """Compute the mean over all taps, with the pixel's own value for what was not trusted."""
+        """Compute the mean over all taps, with the pixel's own value in place of untrusted ones."""
         return (self.sums + (self.total - self.trusted)[None] * values) / self.total[None]
 
 
@@ -54,9 +54,10 @@ def blur_along(
     - `values`: Differentiable.
     - `guide`: a picture from which `trust` computes the weight of a tap; beyond the picture it is
       0.
-    - `trust`: of the guide at the tap, in [0, 1]; it must give 0 for a guide of 0.
-    - `variance`: at each pixel, pixels^2, not negative. Differentiable but at 1/2, where it jumps
-      by 0.4%.
+    - `trust`: computes the trust in a tap, in [0, 1], from its guide; it must be 0 for a guide of
+      0.
+    - `variance`: variance at each pixel, pixels^2, at least 0. Differentiable except at 1/2, where
+      the result jumps by 0.4%.
     - `reach`: the farthest tap, pixels. Static.
 
     **Returns:** `BlurSums`.

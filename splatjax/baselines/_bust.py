@@ -15,8 +15,8 @@ _RIM = 0.002  # of the texture, that stays free along its edges
 def bust_with_textures(texels: int) -> tuple[Mesh, Textures]:
     r"""Make the head of the bust as a mesh with textures, in its own texture coordinates.
 
-    These are longitude and latitude seen from inside the head: the ears, the nostrils and the neck
-    overlap in them, and the nearest texel's color there is that of one of the parts.
+    The coordinates are longitude and latitude as seen from inside the head. Ears, nostrils and neck
+    overlap in them, and a texel there has the color of only one of the overlapping parts.
 
     **Arguments:**
 

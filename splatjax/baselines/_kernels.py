@@ -18,7 +18,7 @@ class Fragments(eqx.Module):
     """Of some splats in some pixels."""
 
     weight: Float[Array, "..."]
-    """0 where a splat leaves nothing."""
+    """0 where a splat has no fragment."""
     nearness: Float[Array, "..."]
     is_inside: Bool[Array, "..."]
 
@@ -85,9 +85,9 @@ class EwaKernel(AbstractSplatKernel):
     r"""The elliptical weighted average: the disc's Gaussian, projected by the affine map at its
     center, blurred by the pixel's.
 
-    In the picture the kernel is `exp(-d^T (J V J^T + I)^-1 d / 2)` and its like, with the pixel's
-    filter of variance `I`, cut where the renderer's kernel ends. The projection is exact only at
-    the center: large splats near the eye may leave holes.
+    In the picture the kernel is similar to `exp(-d^T (J V J^T + I)^-1 d / 2)`, where `I` is the
+    variance of the pixel's filter, and is cut off where the renderer's kernel ends. The projection
+    is exact only at the center: large splats near the eye may leave holes.
 
     **Attributes:**
 
@@ -116,8 +116,8 @@ class EwaKernel(AbstractSplatKernel):
 
     @staticmethod
     def _quadric(f: Footprints, view: AbstractView):
-        """Compute the ellipse of the affine map: the one in perspective, with the nearness of the
-        center everywhere.
+        """Compute the ellipse of the affine map: the ellipse in perspective, but with the nearness
+        of the center everywhere.
         """
         nearness = jnp.where(f.visible, f.nearness, 1.0)
         return tuple(view.squared_radius(nearness, coefficient) for coefficient in (f.a, f.b, f.c))
@@ -158,8 +158,8 @@ class DiscOrPixelKernel(AbstractSplatKernel):
         )
 
     def nearness(self, f, view, dx, dy):
-        """Beyond the disc the nearness is that of its rim: planes seen edge on would otherwise be
-        too near.
+        """Compute the nearness; beyond the disc, use the nearness of its rim, because planes seen
+        edge on would otherwise be too near.
         """
         plane = super().nearness(f, view, dx, dy)
         squared = _in_perspective(f, view, dx, dy, plane)

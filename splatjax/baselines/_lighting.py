@@ -87,7 +87,8 @@ def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "
     **Arguments:**
 
     - `splats`: concrete, not traced; at least 4.
-    - `neighbors`: how many; those that face the other way, beyond a thin part, do not count.
+    - `neighbors`: number of neighbors; those on the far side of a thin part, which face away, do
+      not count.
 
     **Returns:** zero along the splat's own normal, and where the neighbors lie in one line, across
     it.

@@ -7,7 +7,8 @@ that the barycentric coordinates of what the pixel sees are
 
     b_i = (q_j x q_k) / sum of all three,    sum_i b_i q_i = 0
 
-perspective-correct, and with derivatives in every corner. The choice of the face has none.
+They are perspective-correct, and differentiable in every corner. The choice of the face has no
+derivative.
 """
 
 import equinox as eqx
@@ -45,8 +46,8 @@ class Landing(eqx.Module):
 
     @classmethod
     def in_view(cls, corners: Float[Array, "faces 3 3"], view: AbstractView) -> "Landing":
-        """Land faces (mm) in a view. One that shows its back, or reaches before the near plane, is
-        not drawn.
+        """Project faces (mm) in a view. A face that shows its back, or reaches in front of the near
+        plane, is not drawn.
         """
         x, y, depth = view.project(corners.transpose(2, 0, 1))
         in_perspective = isinstance(view, PerspectiveView)
@@ -60,16 +61,16 @@ class Landing(eqx.Module):
 
     @classmethod
     def in_texture(cls, uvs: Float[Array, "faces 3 2"], resolution: int) -> "Landing":
-        """Lay faces out in a square texture of so many texels, v up. Of faces that overlap the last
-        is kept.
+        """Place faces in a square texture of `resolution` texels per edge, v up. Where faces
+        overlap, the last one is drawn.
         """
         x, y = resolution * uvs[..., 0], resolution * (1 - uvs[..., 1])
         shown = jnp.abs(_turn(x, y)) > 0
         return cls(x, y, jnp.ones_like(x), jnp.zeros_like(x), shown, resolution, resolution)
 
     def boxes(self) -> tuple[Int[Array, " faces"], ...]:
-        """Find the first column and row whose centers a face may cover, and how many; none of a
-        face that is not drawn.
+        """Find the first column and row whose centers a face may cover, and the number of columns
+        and rows; 0 for a face that is not drawn.
         """
         begin, size = [], []
         for place, count in ((self.x, self.width), (self.y, self.height)):
@@ -104,7 +105,8 @@ def capacity_for(landing: Landing) -> int:
 def see_faces(landing: Landing, capacity: int) -> SeenFaces:
     r"""Find the nearest face under every pixel center. Not differentiated.
 
-    Every face offers the pixels of its box; the least depth of those it covers wins.
+    Every face is tested at the pixels of its box; of the faces that cover a pixel, the one with the
+    least depth wins.
 
     **Arguments:**
 

@@ -12,8 +12,8 @@ from ._tiles import AbstractListRasterizer, Lists
 
 
 class NearestRasterizer(AbstractListRasterizer):
-    """Takes for every pixel the attributes of the nearest splat there, and covers it whole. Which
-    splat it is has no derivative.
+    """Gives every pixel the attributes of its nearest splat, and full coverage. The choice of the
+    splat has no derivative.
     """
 
     kernel: AbstractSplatKernel = DiscKernel()

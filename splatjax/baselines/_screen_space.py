@@ -33,7 +33,7 @@ class AbstractScreenKernel(eqx.Module):
         pixels_per_mm: Float[Array, "height width"],
         gaussians: SumOfGaussians,
     ) -> tuple[Float[Array, "layers channels height width"], Float[Array, "layers channels"]]:
-        """Compute layers, and the weights with which their sum is the radiant exitance.
+        """Compute layers, and weights; the weighted sum of the layers is the radiant exitance.
         Differentiable in the light's colors.
         """
 
@@ -188,7 +188,7 @@ def diffuse_on_screen(
 
 
 def _follows(depth: Float[Array, "height width"], reach: Float[Array, ""]):
-    """Weigh a tap whose depth differs: less and less up to `reach` mm, nothing where there is no
+    """Return a tap's weight: it falls to 0 at a depth difference of `reach` mm, and is 0 without a
     surface.
     """
     return lambda tap: jnp.where(tap > 0, jnp.clip(1 - jnp.abs(tap - depth) / reach, 0, 1), 0.0)
@@ -201,8 +201,8 @@ def _fetch(
     offset: Float[Array, "height width"],
     axis: int,
 ) -> tuple[Float[Array, "rows height width"], Float[Array, "height width"]]:
-    """Fetch what is trusted so many pixels beside each pixel, and how much is, linearly between
-    two; at the border, the last.
+    """Fetch trusted values at an offset (pixels) from each pixel, and their trust, by linear
+    interpolation; beyond the border, from the last pixel.
     """
     size = depth.shape[axis]
     index = jnp.broadcast_to(

@@ -134,9 +134,9 @@ def diffuse_in_texture(
 ) -> TextureLayers:
     r"""Diffuse light in the texture of a mesh.
 
-    The irradiance map is blurred along u and along v by what one variance has more than the one
-    before, so that layer k is blurred by all of `v_k`; the stretch map is blurred with it. Weights
-    are divided by their sum on the charts.
+    The irradiance map is blurred along u and along v by the difference of successive variances, so
+    that layer k is blurred by `v_k` in total; the stretch map is blurred with it. Weights are
+    divided by their sum on the charts.
 
     **Arguments:**
 
@@ -206,8 +206,8 @@ def look_up_layers(
 
 
 def _spread(rows, valid, variance, channels: int, reaches: tuple[int, ...]):
-    """Blur along u and along v, each by the stretch there; give also how much of the weights was on
-    the charts.
+    """Blur along u and along v, each scaled by the local stretch; also return the fraction of the
+    weights that was on the charts.
     """
     kept = valid
     for axis, extent, reach in ((1, channels, reaches[0]), (0, channels + 1, reaches[1])):

@@ -74,7 +74,7 @@ class TexturedMesh(eqx.Module):
         return Bounds(center, 1.001 * jnp.sqrt(jnp.max(jnp.sum(offset * offset, axis=1))))
 
     def lengths(self) -> tuple[Float[Array, " faces"], Float[Array, " faces"]]:
-        """Compute how many mm of the surface a step of one along u, and along v, is; 0 on a face
+        """Compute the length on the surface, mm, of a unit step along u and along v; 0 on a face
         without a chart.
         """
         along_u, along_v, _ = self._along()
@@ -135,8 +135,8 @@ def surface_points(
 
     **Arguments:**
 
-    - `faces`: of the points.
-    - `shares`: their barycentric coordinates there.
+    - `faces`: face of each point.
+    - `shares`: barycentric coordinates of each point in its face.
     """
     carried = jnp.concatenate([mesh.corners(), mesh.normals[mesh.faces], mesh.uvs], axis=2)
     blended = jnp.sum(carried[faces] * shares[..., None], axis=1)
@@ -169,8 +169,8 @@ def look_up(
 def look_up_charts(
     picture: Float[Array, "h w channels"], valid: Float[Array, "h w"], uvs: Float[Array, "points 2"]
 ) -> Float[Array, "points channels"]:
-    """Look up a picture that is valid only on the charts (`valid` 1, not 0), by its valid texels; 0
-    without any.
+    """Look up a picture that is valid only on the charts (where `valid` is 1), from its valid
+    texels; 0 if there are none.
     """
     height, width = picture.shape[:2]
     weights, rows, columns = _four(uvs, height, width)

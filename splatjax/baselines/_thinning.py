@@ -26,15 +26,15 @@ _AT_ONCE = 8
 
 
 class ThinnedDiffuser(AbstractDiffuser):
-    r"""Sums over one of every `keep` splats, at all splats. The kept ones are evenly spread,
-    because a plan sorts splats by position.
+    r"""Sums over one in every `keep` splats, evaluated at all splats. The kept ones are evenly
+    spread, because a plan sorts splats by position.
 
     The renderer's own `ClusterDiffuser` merges splats instead, with a far smaller error for the
     same number.
 
     **Attributes:**
 
-    - `keep`: one splat of how many. Static.
+    - `keep`: number of splats of which one is kept. Static.
 
     **Source:** Kim et al. 2010, section 4.2 and Figure 5.
     """
@@ -46,7 +46,7 @@ class ThinnedDiffuser(AbstractDiffuser):
 
 
 class ThinnedPlan(AbstractDiffusionPlan):
-    """The plan of sums over fewer splats: the number of omitted ones."""
+    """The plan of sums over fewer splats: of every `keep` splats, one is kept."""
 
     keep: int = eqx.field(static=True)
 
@@ -124,8 +124,8 @@ def layer_contrast(
     r"""Measure the variation of light within a layer's width: `s`, relative to the layer's root
     mean square.
 
-    The standard deviation of the light under `G(v / 2, r)`, which is the square of the layer's
-    Gaussian; root mean square over 512 splats, evenly chosen, and over the channels.
+    It is the standard deviation of the light weighted by `G(v / 2, r)`, the square of the layer's
+    Gaussian, averaged (root mean square) over 512 evenly chosen splats and over the channels.
 
     **Arguments:**
 

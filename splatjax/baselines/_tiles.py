@@ -109,14 +109,14 @@ class Lists(eqx.Module):
     grid: TileGrid
 
     def map_blocks(self, look: Callable[..., Result], *more) -> Result:
-        """Look at every block, one after the other: its splats `[lanes, slots]`, what more there is
-        of its chunk, and offsets.
+        """Apply a function to every block, one after the other: to its splats `[lanes, slots]`, the
+        offsets, and further values of its chunk.
 
         **Arguments:**
 
-        - `look`: of ids `[lanes, slots]`, footprints `[lanes, slots, 1]`, offsets in x and y
-          `[lanes, slots, pixels]` and of each of `more` `[lanes, ...]`.
-        - `more`: of every tile, as `reduce_blocks` returns it.
+        - `look`: function of ids `[lanes, slots]`, footprints `[lanes, slots, 1]`, offsets in x and
+          y `[lanes, slots, pixels]` and of each of `more` `[lanes, ...]`.
+        - `more`: values of every tile, as `reduce_blocks` returns them.
         """
         grid, dtype = self.grid, self.footprints.x.dtype
         last = self.bins.order.shape[0] // grid.lanes - 1

@@ -18,13 +18,15 @@ _APART = 6.0
 
 
 class FarSide(eqx.Module):
-    """For each texel, and each light with a shadow map, the entry of light on the far side."""
+    """For each texel and each light with a shadow map, the point on the far side where light
+    enters.
+    """
 
     uvs: Float[Array, "lights points 2"]
     nearness: Float[Array, "lights points"]
     """`exp(-thickness / scale)`: 0 where there is no far side, 1 where it is close."""
     apart: Float[Array, "lights points"]
-    """From the texel to it in the texture, mm as the texture has them on average."""
+    """Distance in the texture from the texel to this point, in average mm of the texture."""
     scale: Float[Array, ""]
     """mm."""
 
@@ -69,8 +71,8 @@ class OpaqueParts(AbstractThinParts):
 
 
 class TranslucentShadowMap(AbstractThinParts):
-    r"""A shadow map with the texture coordinates and the distance of the entry of light (modified,
-    of d'Eon and Luebke).
+    r"""A shadow map with the texture coordinates and the distance of the point where light enters
+    (the modified map of d'Eon and Luebke).
 
     A Gaussian is separable in depth too: the transmitted light is the blurred light of the far side
     times `exp(-d^2 / 2v)`. The thickness `d` is measured along the light, reduced by the cosine

@@ -219,8 +219,8 @@ class Fit:
             )
 
     def _target(self) -> tuple[Coefficients | None, Reference]:
-        """Read the input, and make its profile: the coefficients, `None` where it is measured, and
-        what is fitted; raise for options without effect on the kind of input.
+        """Read the input; return its coefficients, `None` if it is measured, and the profile to
+        fit. Raise `ValueError` for options without effect on this kind of input.
         """
         kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
         changed = {

@@ -53,8 +53,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
     - `args`: the words after `splatjax`; those of the process when not given.
 
-    **Returns:** the exit status: 0; 2 after one line on stderr about a fault in what was given; 1
-    after one about a fault in splatjax; 130 when interrupted, 141 when stdout is a closed pipe.
+    **Returns:** the exit status: 0 for success; 2 for invalid input and 1 for a fault of splatjax,
+    both with one line on stderr; 130 when interrupted; 141 when stdout is a closed pipe.
     """
     words = list(sys.argv[1:] if args is None else args)
     try:
@@ -85,7 +85,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def parsed(words: list[str]) -> Any:
-    """Return the command of some words; raise `SystemExit` if they ask for help or the version, or
+    """Parse words into a command; raise `SystemExit` for help, for the version, and for words that
     are not a command.
 
     Only the command of the first word is parsed, so that help and errors are about it alone.

@@ -1,5 +1,5 @@
-"""`splatjax materials`: what is in the library; `splatjax export`: it in the terms of other
-renderers; `splatjax sample`: from a mesh with its maps to splats.
+"""`splatjax materials` lists the library, `splatjax export` writes materials and scenes for other
+renderers, and `splatjax sample` converts a mesh with maps to splats.
 """
 
 import re
@@ -194,8 +194,8 @@ class Sample:
     rounded: bool = True
     #: Upward axis of the file; splats have +y up.
     up: UpAxis = "y"
-    #: Angle between triangles above which an edge is hard, degrees, if the file has no normals or
-    #: smooth ones.
+    #: Angle between triangles above which an edge is hard, degrees, if the file has no normals, or
+    #: normals that differ by more from their triangles.
     crease_angle: float = 40.0
     #: Map of the mesh's diffuse color, sRGB. By default the texture of the file, if any.
     albedo: OptionalPath = None

@@ -41,10 +41,10 @@ class Reference:
 
     **Attributes:**
 
-    - `single`: light that scatters once, where it is kept apart from the profile.
-    - `description`: of a profile that coefficients alone do not give back.
-    - `angles`: by which its light depends on those of entry and exit.
-    - `weights`: those that the fit may choose from.
+    - `single`: light that scatters once, if it is separate from the profile.
+    - `description`: description of a profile that coefficients alone do not define.
+    - `angles`: dependence of its light on the angles of entry and exit.
+    - `weights`: the weights that the fit allows.
     """
 
     profile: sj.gaussians.AbstractProfile
@@ -113,7 +113,9 @@ def _without_single(
     half_space: sj.scattering.HalfSpace,
     description: str | None,
 ) -> Reference:
-    """Keep single scattering apart from a profile without it, with the angles of the rest."""
+    """Combine a profile without single scattering, the single scattering, and the angles of the
+    rest.
+    """
     cosines = jnp.asarray(half_space.cosines())
     angles = half_space.angular_law(single.directional_albedo(cosines))
     return Reference(profile, _BEYOND, single, f"{description}, without single scattering", angles)
@@ -216,8 +218,8 @@ def _errors_by_distance(
     gaussians: sj.SumOfGaussians,
     rule: sj.scattering.AbstractRadialRule,
 ) -> list[tuple[str, str]]:
-    """Return rows of relative errors, from where a fit counts to where all channels have a
-    hundredth of the peak of their light by logarithmic radius.
+    """Return rows of relative errors, over the radii of the fit at which the light of any channel,
+    per logarithmic radius, is above a hundredth of its peak.
     """
     nodes, weights = (np.asarray(values) for values in rule.radii(profile))
     measured = profile.known_radii()

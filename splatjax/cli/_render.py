@@ -119,7 +119,8 @@ class Render(PictureOptions):
         }
 
     def _drawn(self, scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings) -> Rendered:
-        # Before the preview, which is drawn within the first compilation, so that none is nested.
+        # Sample the lights before the preview, which is drawn during the first compilation, so that
+        # no compilation is nested.
         samples = [sample for light in scene.lights for sample in light.samples()]
         with preview(lambda side: rough_picture(scene, samples, camera, self.exposure, side)):
             with stage("planning"):
@@ -287,8 +288,8 @@ def rough_picture(
     scene: sj.Scene, samples: Sequence[Any], camera: sj.Camera, exposure: float, side: int
 ) -> list:
     """Draw the centers of splats, matte and under samples of the lights, by NumPy alone, which
-    compiles nothing. The longer side has so many pixels at most, fewer for few splats; the height
-    is even. Return rows of red, green and blue up to 255.
+    compiles nothing. The longer side has at most `side` pixels, fewer for few splats; the height is
+    even. Return rows of red, green and blue up to 255.
     """
     scene, camera, lights = jax.device_get((scene, camera, samples))
     # Of millions of splats some will do.

@@ -1,4 +1,4 @@
-"""Scenes of the command line: a camera from a file, and scenes as their files would be."""
+"""Scenes of the command line: cameras from files, and the contents of scene files."""
 
 import os
 from dataclasses import MISSING, fields, replace
@@ -46,7 +46,7 @@ def scene_of_options(options: Any, images: str | list[str], *record: Any) -> dic
 
 
 def scene_of_file(table: Any, *record: Any) -> dict[str, Any]:
-    """Return a scene as its file would be, from that of another; `record` as above."""
+    """Return the contents of a scene's file, from the table of another file; `record` as above."""
     images = [light.get("image", "") for light in table.entries["lights"]]
     g = sj.io.load_mean_cosine(sj.io.material_of_scene(table))
     return scene_in_folder(table.folder, table.entries["splats"], images, g, *record)

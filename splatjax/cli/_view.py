@@ -207,8 +207,9 @@ class ViewOptions:
     def lights(
         self, material: sj.Material, azimuth: float, light_azimuth: float
     ) -> tuple[sj.scene.AbstractLight, ...]:
-        """Return the light, in the channels of a material, and the fill beside a camera at an
-        azimuth: always on the same side of it; or the environment, which turns with the light.
+        """Return the light and the fill, in the channels of a material, or the environment, which
+        turns with the light. The fill is always on the same side of the camera, whose azimuth is
+        given.
         """
         first_azimuth, elevation, fill = self.single_light
         if self._environment is not None:

@@ -110,7 +110,7 @@ class LeastCount(eqx.Module):
     **Attributes:**
 
     - `error`: Eq. 4 that no channel may exceed, positive.
-    - `max_count`: number of Gaussians to try.
+    - `max_count`: largest number of Gaussians to try.
     """
 
     error: float
@@ -202,8 +202,8 @@ def fit_gaussians(
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
     - `weights`: `FreeWeights()` (default); `FixedTotalReflectance()`, which keeps the energy; or
       `NonNegativeWeights(...)`, either of these without negative weights.
-    - `start`: `GivenVariances(...)` near the variances of the best fit, from which one fast search
-      starts; it needs a given count. By default fits with fewer Gaussians give the start.
+    - `start`: variances near those of the best fit, `GivenVariances(...)`, for a single fast
+      search; it requires a fixed count. By default, fits with fewer Gaussians provide the start.
     - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for
       a profile with standard errors.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.

@@ -201,9 +201,9 @@ def fit_medium(
 ) -> MediumFit:
     r"""Fit absorption and scattering to a measured profile: weighted least squares on its samples.
 
-    The model is the same as for pictures: coefficients, profile, sum of Gaussians, the variance of
-    the beam added to each; it is differentiated as a whole. Channels are independent. Use double
-    precision.
+    The model is the one used for pictures: a sum of Gaussians is fitted to the profile of the
+    coefficients, and the variance of the beam is added to each Gaussian. It is differentiated as a
+    whole. Channels are independent. Use double precision.
 
     **Arguments:**
 

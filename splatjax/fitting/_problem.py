@@ -83,8 +83,8 @@ class Expansion(eqx.Module):
     **Attributes:**
 
     - `cost`: the sum of squares.
-    - `gradient`, `hessian`: of the cost, the full ones.
-    - `residuals`, `jacobian`: of each channel at the nodes.
+    - `gradient`, `hessian`: full gradient and Hessian of the cost.
+    - `residuals`, `jacobian`: residuals of each channel at the nodes, and their Jacobian.
     """
 
     cost: Float[Array, ""]

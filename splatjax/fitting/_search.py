@@ -34,8 +34,8 @@ _STEPS = 64
 # this share of it,
 _GAIN = 1e-6
 
-# or by less than the square of this many units of rounding of the profile's norm: there is no more
-# in the numbers.
+# or by less than the square of this many units of rounding of the profile's norm, because the
+# precision allows no more.
 _FLOOR = 100.0
 
 _NEWTON_STEPS = 32
@@ -183,7 +183,7 @@ def _projected(
 
 @_projected.defjvp
 def _projected_jvp(primals, tangents):
-    """The closed form; the problem is a constant of a search."""
+    """Differentiate in closed form; the problem is constant during a search."""
     problem, active, point = primals
     expansion = problem.expand(point, active)
     return expansion.residuals, jnp.einsum("cnk,k->cn", expansion.jacobian, tangents[2])
@@ -204,9 +204,7 @@ class AbstractSpread(eqx.Module):
         problem: FitProblem,
         start: GivenVariances | None,
     ) -> Any:
-        """Apply a function to each problem and its start; with a leading axis where there are
-        several.
-        """
+        """Apply a function to each problem and its start; several problems add a leading axis."""
 
 
 class SharedVariances(AbstractSpread):
@@ -295,7 +293,7 @@ def _gain(expansion: Expansion) -> Float[Array, ""]:
     normal = jnp.einsum("cni,cnj->ij", expansion.jacobian, expansion.jacobian)
     squared = jnp.diagonal(normal)
     lengths = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-    # Not half the gradient: the Jacobian is orthogonal to the basis, so that the rounding of the
-    # weights does not enter.
+    # This replaces half the gradient: the Jacobian is orthogonal to the basis, so that rounding of
+    # the weights has no effect.
     along = jnp.einsum("cnk,cn->k", expansion.jacobian, expansion.residuals) / lengths
     return along @ invert_moving(normal / (lengths[:, None] * lengths[None])) @ along

@@ -21,7 +21,7 @@ from lineax.internal import (
     unravel_solution,
 )
 
-_UNSEEN = 1e-12  # squared norm of a Gaussian whose own is 1
+_UNSEEN = 1e-12  # ridge for Gaussians without norm at the nodes; all others have norm 1
 _ROUNDING = 100.0
 _EXCHANGES = 64
 
@@ -108,8 +108,9 @@ class AbstractWeights(eqx.Module):
 
         **Arguments:** (all differentiable)
 
-        - `basis`: scaled Gaussians at the roots of the quadrature's weights, of full column rank.
-        - `target`: the profile there.
+        - `basis`: scaled Gaussians at the nodes, times the roots of the quadrature's weights; of
+          full column rank.
+        - `target`: the profile at the nodes, times the same roots.
         - `energies`: weight of a unit coefficient; `energies @ coefficients` is the energy of the
           sum.
         - `total`: the energy of the profile.
@@ -168,7 +169,7 @@ class FixedTotalReflectance(AbstractWeights):
 
 
 class NonNegativeWeights(AbstractWeights):
-    """Non-negative weights, as in a mixture; otherwise as `among`.
+    """Non-negative weights, as in a mixture, under the constraint of `among`.
 
     Fits of single channels of a dipole have no negative weights anyway. With shared variances, some
     may become 0.
@@ -177,8 +178,8 @@ class NonNegativeWeights(AbstractWeights):
 
     - `among`: `FreeWeights()` (default) or `FixedTotalReflectance()`.
 
-    **Source:** the conditions of Kuhn and Tucker; one index at a time is exchanged, the last first
-    (Murty 1974), which ends for every positive definite problem.
+    **Source:** the Kuhn-Tucker conditions; indices are exchanged one at a time, the last first
+    (Murty 1974), which terminates for every positive definite problem.
     """
 
     among: AbstractWeights = FreeWeights()

@@ -30,11 +30,12 @@ def bust_mesh() -> Mesh:
     """
     with np.load(profiles_folder() / "bust.npz") as file:
         steps, corners, tilts = (file[name].astype(int) for name in ("steps", "corners", "tilts"))
-    # Vertices are steps from the one before, in the order in which faces come to them.
+    # Each vertex is stored as the step from the previous one, in the order in which faces first use
+    # them.
     vertices = _STEP * np.cumsum(steps, axis=0)
-    # A corner is 0 at a new vertex, else k at the k-th last of those before.
+    # A corner is 0 for a new vertex, else k for the k-th last of the vertices so far.
     faces = (np.cumsum(corners == 0) - np.maximum(corners, 1)).reshape(-1, 3)
-    # Normals are tilted from the mean of those of the faces around.
+    # Normals are stored as tilts from the mean normal of the surrounding faces.
     normals = unit(vertex_normals(vertices, faces) + _TILT * tilts)
     x, y, z = np.moveaxis(vertices[faces] - _MIDDLE, -1, 0)
     u = np.arctan2(x, z) / (2 * np.pi) + 0.5
@@ -65,7 +66,7 @@ def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
 
 
 _SKIN = np.asarray([0.60, 0.375, 0.285])
-_BLOOD = np.asarray([1.0, 0.70, 0.68])  # what more blood below the skin takes from each channel
+_BLOOD = np.asarray([1.0, 0.70, 0.68])  # factor on each channel for more blood below the skin
 _LIPS = np.asarray([0.50, 0.205, 0.185])
 _HAIR = np.asarray([0.15, 0.095, 0.07])
 _SCALP = np.asarray([0.47, 0.335, 0.285])

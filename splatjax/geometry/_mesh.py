@@ -71,15 +71,15 @@ def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return np.where(length > 0, vectors / np.where(length > 0, length, 1), up)
 
 
-# Difference of two triangles' normals at one place above which their edge is hard.
+# Cosine of the angle between two triangles' normals at one place, below which their edge is hard.
 _SOFT = np.cos(np.radians(10))
 
 
 def shared_edges(places: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "n 2 2"]:
-    """Pair the edges of triangles, given by the places of their corners, that join the same two
-    places. Of an edge of more than two triangles each is paired with the next.
+    """Pair the edges of triangles that join the same two places, given the places of all corners.
+    At an edge of more than two triangles, each triangle is paired with the next.
 
-    **Returns:** for each end of an edge the corner of either triangle, as `3 * face + k`.
+    **Returns:** the corners of the two triangles at each end of an edge, as `3 * face + k`.
     """
     starts, ends = places[:, [1, 2, 0]].ravel(), places[:, [2, 0, 1]].ravel()
     key = np.minimum(starts, ends) * np.int64(places.max(initial=0) + 1) + np.maximum(starts, ends)
@@ -189,7 +189,7 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
         (off_end * tip + off_tip * end) / (off_end + off_tip)
         for end, off_end in zip((left, right), off_ends, strict=True)
     )
-    # What stays of a split triangle: its tip, or the two triangles below it.
+    # The remaining part of a split triangle: its tip, or the two triangles on the other side.
     pieces = [
         (tip_above, (tip, first, second)),
         (~tip_above, (first, left, right)),

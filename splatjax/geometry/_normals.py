@@ -244,17 +244,18 @@ def _turn_cavities(
 ) -> None:
     r"""Reverse, in place, patches that would form a body inside a body.
 
-    The winding number of a surface is 0 outside, 1 inside and on the surface itself their mean,
-    1/2. A patch is turned when that brings the number on it, of everything else and of itself,
-    nearer to 1/2: a shell within a body makes it 3/2 where it faces outward, and 1/2 where it faces
-    its middle. The greatest patch comes first.
+    The winding number of a surface is 0 outside, 1 inside, and their mean, 1/2, on the surface
+    itself. A patch is reversed if this brings the total winding number on it nearer to 1/2: on a
+    shell within a body it is 3/2 if the shell faces outward, and 1/2 if it faces its middle. The
+    largest patch comes first.
 
     **Arguments:**
 
-    - `points`: mm, near each other in their order as far as may be.
-    - `oriented`: normals as long as the point's area, mm^2; those of turned patches are turned.
-    - `patches`: points of each.
-    - `signs`: those of turned patches are turned.
+    - `points`: mm, in an order that keeps nearby points together.
+    - `oriented`: normals whose length is the area of the point, mm^2; reversed for reversed
+      patches.
+    - `patches`: indices of the points of each patch.
+    - `signs`: signs of the normals; reversed for reversed patches.
 
     **Source:** Barill et al. 2018, "Fast Winding Numbers for Soups and Clouds", equation 4; Xu et
     al. 2023, "Globally Consistent Normal Orientation for Point Clouds by Regularizing the
@@ -276,8 +277,8 @@ def _winding(
     points: Float[np.ndarray, "n 3"],
     oriented: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, " probes"]:
-    """Compute winding numbers on a surface, of points in blocks; those of a block that a probe
-    belongs to nearly cancel.
+    """Compute winding numbers on a surface, summing points in blocks; the terms of the block around
+    a probe nearly cancel.
     """
     starts = np.arange(0, len(points), _BLOCK)
     sizes = np.diff(np.append(starts, len(points)))

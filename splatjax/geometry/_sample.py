@@ -96,9 +96,9 @@ def perturbed_normals(
     """Turn tangent-space normals into world space, in the frame of the mesh's texture coordinates,
     and make them unit.
 
-    The tangent is that of the face (the direction in which u grows), made orthogonal to the
-    interpolated normal; the bitangent completes the frame on the side where v grows. A face whose
-    texture is degenerate keeps its normal.
+    The tangent is the direction in which u grows on the face, made orthogonal to the interpolated
+    normal; the bitangent completes the frame on the side where v grows. Faces with degenerate
+    texture coordinates keep the normal.
     """
     assert mesh.uvs is not None
     corners, uvs = mesh.corners()[points.faces], mesh.uvs[points.faces]
@@ -179,8 +179,8 @@ def _radii(
 ) -> Float[np.ndarray, " n"]:
     """Choose radii that leave no hole, and extend little beyond the borders of the surface.
 
-    A splat is seen up to about 0.8 of its radius; a third of a spacing beyond a border, these lie
-    in a straight line, and the border itself is covered in full.
+    A splat is visible up to about 0.8 of its radius. A third of a spacing beyond a border, the
+    visible edges form a straight line, and the border itself is fully covered.
     """
     radii = 1.5 * np.sqrt(areas)
     if images is not None and images.shape[1]:

@@ -109,7 +109,8 @@ def surface_cells(
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence
 _EDGE_TOLERANCE = 1e-9
 _WALK = 64
-_PIECE, _IMAGES = 0.25, 8  # spacings of a border that are looked at together; how many of these
+# Length of the pieces of a border, in spacings; number of pieces near a point.
+_PIECE, _IMAGES = 0.25, 8
 
 
 class SurfacePoints(NamedTuple):
@@ -248,22 +249,22 @@ def _settle(mesh: Mesh, beyond: np.ndarray, faces: np.ndarray, points: np.ndarra
 
 
 _MIDDLES = 0.5 * np.asarray([[1.0, 1, 0], [0, 1, 1], [1, 0, 1]])
-# Of a triangle with the middles of its edges after its corners.
+# The quarters of a triangle whose corners are followed by the middles of its edges.
 _QUARTERS = np.asarray([[0, 3, 5], [1, 4, 3], [2, 5, 4], [3, 4, 5]])
 
 
 class Rounding:
     r"""A curved surface that follows the normals of a mesh.
 
-    Flat triangles under smooth normals shade themselves where the normals still face the light,
-    triangle by triangle: a ragged edge between light and shadow. The surface through the vertices
-    that has the normals there lies, to second order,
+    Flat triangles with smooth normals shadow themselves, one by one, where the normals still face
+    the light, so that the edge between light and shadow is ragged. To second order, the surface
+    through the vertices with these normals has the point
 
         x + 1/2 sum_i u_i ((v_i - x) . n_i) n_i
 
-    from a point `x` of a triangle, with corners `v_i`, normals `n_i` and barycentric coordinates
-    `u_i`. That is a sum over edges, so that neighbors meet. Edges stay straight at the vertices of
-    hard edges: a box stays a box.
+    for a point `x` of a triangle with corners `v_i`, normals `n_i` and barycentric coordinates
+    `u_i`. This equals a sum over edges, so that neighbors meet. Edges stay straight at the vertices
+    of hard edges: a box stays a box.
 
     **Source:** Boubekeur and Alexa 2008, "Phong tessellation", with the weight (they prefer 3/4)
     that keeps spheres round.

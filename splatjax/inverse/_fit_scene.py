@@ -115,7 +115,7 @@ class FittedScene(eqx.Module):
     - `pictures`: rendered; NaN where a pixel does not count.
     - `residuals`: rendered minus observed pictures.
     - `result`: the outcome, as a message (`optimistix.RESULTS`).
-    - `coordinates`: of the parts; `state`: of the fit, from which another continues (`start`).
+    - `coordinates`, `state`: coordinates and state from which another fit can `start`.
     """
 
     splats: Splats

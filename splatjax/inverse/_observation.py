@@ -73,8 +73,8 @@ class Observation(eqx.Module):
     - `picture`: radiance, like `Frame.beauty`; NaN where a pixel is unknown.
     - `camera`: a camera with as many pixels.
     - `lights`: all lights of the picture.
-    - `mask`: the pixels that count; `None` for all. Pixels that the body does not fill never count,
-      because the background is unknown.
+    - `mask`: the pixels that count; `None` for all. Pixels that the body does not fill count only
+      with a `BlackBackground`.
     - `deviation`: standard deviation of the noise, for each pixel and channel or one number.
       `None`: it is unknown and uniform; error bars then follow from the residuals. Pictures without
       a deviation have equal weight, each relative to its brightness.

@@ -56,8 +56,8 @@ class AbstractPart(eqx.Module):
         """Apply coordinates to the part. Differentiable."""
 
     def prior_residuals(self, x: PyTree[Array], prepared: PyTree[Array]) -> PyTree[Array]:
-        """Divide coordinates by their expected deviations: under the prior independent, of mean 0
-        and deviation 1. `None` without a prior. Linear.
+        """Divide coordinates by their expected deviations; under the prior, the results are
+        independent, with mean 0 and deviation 1. Return `None` without a prior. Linear.
         """
         return None
 

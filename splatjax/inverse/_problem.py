@@ -41,7 +41,7 @@ _LARGER = 3.0
 _NARROWEST, _WIDEST = 0.05, 200.0
 # Spacing of the log variances for which plans are made; a plan is valid over a wider range.
 _GRID = math.log(1.15)
-# In variance: of coefficients that are off by a factor of three at the start.
+# Factor on the range of variances, for starts whose coefficients are off by a factor of three.
 _REACH = 10.0
 
 
@@ -80,8 +80,8 @@ def render_layers(
     """
 
     def render(plans):
-        # By plan and lights of the pictures: for three or more under the same lights, the light is
-        # computed once. For two, compilation costs more than this saves.
+        # Keys are the plan and the lights of a picture: for three or more under the same lights,
+        # the light is computed once. For two, compilation costs more than this saves.
         keys = [
             (id(plan), *(leaf.tobytes() for leaf in jax.tree.leaves(jax.device_get(view.lights))))
             for view, plan in zip(pictured_scenes, plans, strict=True)
@@ -104,8 +104,8 @@ def render_layers(
 
     pictures = render(plans) if plans else []
     if not pictures or any(float(picture.overflow) > 0 for picture in pictures):
-        # On a coarse grid, so that similar materials have plans of the same shapes, and one
-        # program.
+        # Variances are rounded to a coarse grid, so that similar materials have plans of the same
+        # shapes, and share a program.
         variances = jnp.round(jnp.log(material.gaussians.variances) / _GRID) * _GRID
         rounded = SumOfGaussians(jnp.exp(variances), material.gaussians.weights)
         plans = make_plans(pictured_scenes, material.surface_of(rounded), settings)
@@ -114,7 +114,8 @@ def render_layers(
 
 
 def wide_variances(media: Sequence[Medium], splats: Splats) -> Float[Array, " gaussians"]:
-    r"""Choose variances (mm^2) that serve all media near some: each three times the one before.
+    r"""Choose variances (mm^2) that serve all media near the given ones; each is three times the
+    previous one.
 
     They cover the dipoles of coefficients up to three times as large or as small. None is much
     wider than the body.
@@ -131,8 +132,8 @@ def wide_variances(media: Sequence[Medium], splats: Splats) -> Float[Array, " ga
 
 
 class Unknowns(eqx.Module):
-    r"""The layout of the unknowns: log sigma_a, log sigma_s' per channel, then log factors of the
-    lights.
+    r"""The layout of the unknowns: log sigma_a of all channels, log sigma_s' of all channels, then
+    the logarithms of the factors on the lights.
 
     **Attributes:**
 
@@ -184,9 +185,9 @@ class RecoveryProblem(eqx.Module):
 
     **Attributes:**
 
-    - `pictures`: of all materials, restricted to the points of pixels that count.
+    - `pictures`: layers for all materials, restricted to the points in pixels that count.
     - `counted`: 1 for pixels that count, else 0.
-    - `fit`: the Gaussians of a profile. Differentiable.
+    - `fit`: computes the Gaussians of a profile. Differentiable.
     """
 
     pictures: tuple[DiffusionBasis, ...]
@@ -277,10 +278,10 @@ class Solution(eqx.Module):
 
     **Attributes:**
 
-    - `information`: the inverse of the covariance that noise of the given deviations leaves
-      (Laplace, by Gauss and Newton); after the unknowns come, channel by channel, the logarithms of
-      the widths below which layers are unresolved.
-    - `gaussians`, `radiance`: of the point.
+    - `information`: inverse of the covariance due to noise of the given deviations (Laplace, in the
+      Gauss-Newton approximation); the unknowns are followed, channel by channel, by the logarithms
+      of the widths below which layers are unresolved.
+    - `gaussians`, `radiance`: Gaussians and radiance at the point.
     - `unresolved`: the fraction of the light of each channel in unresolved layers.
     """
 

@@ -92,8 +92,8 @@ def recover(
     - `observations`: one or more.
     - `splats`: the splats of the body, mm. Their albedo is assumed known; without albedo the
       coefficients alone give the color.
-    - `starts`: starts of the search; their `eta` is assumed known and must be the same. Of several,
-      the search with the least loss counts.
+    - `starts`: starts of the search; their `eta` is assumed known and must be the same. If there
+      are several, only the search with the least loss is continued.
     - `surface`: a material of known specular strength and roughness, and of the same index as the
       starts; its Gaussians are not used. By default there is no specular lobe.
     - `model`: `TransportModel()`, by default, or `DiffusionModel()`, the classical dipole.
@@ -271,7 +271,7 @@ def next_pictures(
     *,
     settings: RenderSettings = RenderSettings(),
 ) -> list[Prediction]:
-    r"""Rank pictures that could be taken, by the error bars of the coefficients with each of them.
+    r"""Rank candidate pictures by the error bars of the coefficients after taking each of them.
 
     Each is rendered once with the recovered material, and differentiated. Its noise is the same
     fraction of its brightness as in the earlier pictures. Information adds up, and its inverse is

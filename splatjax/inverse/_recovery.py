@@ -141,9 +141,9 @@ def _power(name: str, power: float) -> str:
     return name if round(power, 2) == 1 else f"{name}^{power:.2g}"
 
 
-# Standard deviation of the logarithm of the width below which a layer is unresolved: twice as many
-# splats change it by as much, and for regular splats it is a factor of 2.5 below that for scattered
-# ones.
+# Standard deviation of the logarithm of the width below which a layer is unresolved. Doubling the
+# number of splats changes the logarithm by as much; regularly spaced splats have a width 2.5 times
+# smaller than scattered ones.
 _RESOLUTION = 0.5 * np.log(2.0)
 # Chi-squared per degree of freedom above which the model is incomplete.
 _TOO_LARGE = 1.5

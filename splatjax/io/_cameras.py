@@ -139,7 +139,8 @@ def _transforms(path: Path) -> _Found:
         lens = content | frame
         if lens.keys() >= {"w", "camera_angle_x"}:
             lens.setdefault("fl_x", 0.5 * lens["w"] / np.tan(0.5 * lens["camera_angle_x"]))
-        pose = np.asarray(frame["transform_matrix"], float) * [1, -1, -1, 1]  # up and back
+        # The file's axes are right, up and back.
+        pose = np.asarray(frame["transform_matrix"], float) * [1, -1, -1, 1]
         yield frame.get("file_path", str(index)), lens, pose
 
 

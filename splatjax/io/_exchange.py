@@ -61,7 +61,9 @@ def light_pose(light: AbstractLight) -> Float[np.ndarray, "4 4"]:
 
 
 def strength(light: AbstractLight) -> tuple[float, list[float]]:
-    """Return the largest strength of the channels of a light, and the color: its fractions."""
+    """Return a light's strength in its brightest channel, and its color: all strengths divided by
+    this.
+    """
     values = np.broadcast_to(np.asarray(getattr(light, light.strength_field), float), 3)
     greatest = float(values.max())
     return greatest, (values / (greatest or 1.0)).tolist()

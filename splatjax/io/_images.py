@@ -136,9 +136,9 @@ def write_png(
 def write_animation(
     path: StrPath, frames: Sequence[StrPath], *, frames_per_second: float = 24.0
 ) -> None:
-    r"""Join pictures to one endlessly repeating animated WebP file, completely or not at all.
+    r"""Join pictures into a lossless, endless WebP animation, completely or not at all.
 
-    **Arguments:** the file is lossless, and plays in every browser
+    **Arguments:**
 
     - `frames`: PNG files in order, at least one, all of one size.
     - `frames_per_second`: from 0.1 to 60; browsers slow down faster ones.
@@ -212,8 +212,8 @@ def write_exr(
     - `variances`: variances of the Gaussians, mm^2, written to the header.
     - `manifest`: settings of the picture, written to the header as JSON (`read_manifest`).
     - `camera`: the camera of the picture, written as `worldToCamera` (right, up and forward, mm)
-      and `worldToNDC` (column and row divided by the size of the picture), which `load_cameras`
-      reads. Both multiply row vectors: `[x y z 1] M`, divided by the last entry.
+      and `worldToNDC` (column and row divided by the size of the picture), as in RenderMan. Both
+      multiply row vectors: `[x y z 1] M`, divided by the last entry.
     - `half`: write half precision, except for depth and position.
 
     **Raises:** `ValueError` for another suffix than `.exr`, `FileNotFoundError` when the folder

@@ -41,7 +41,7 @@ ENVIRONMENTS = {"studio": studio, "overcast": overcast_sky, "sun": sun_and_sky}
 _OF_MAPS = ("rotation", "strength", "up", "directions", "count", "cast_shadows")
 _ANGLES = ("inner_angle", "outer_angle")
 _OPTIONAL = _OF_MAPS + _ANGLES
-# Of lights that face a target: from where, and what that replaces.
+# For lights that may face a `target`: their position, and the entry that the target replaces.
 _AIMED = {
     "spot": ("position", "direction"),
     "beam": ("origin", "direction"),
@@ -154,7 +154,7 @@ def read_observations(path: StrPath) -> list[Observation]:
 
 
 def picture_paths(path: StrPath) -> list[Path]:
-    """Return the files of the observations of a file, itself first."""
+    """Return the path of a file of observations, followed by the files that it lists."""
     path = Path(path)
     pictures = read_toml(path, "name one that lists pictures")["pictures"]
     return [path] + [

@@ -29,7 +29,8 @@ from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 _LUMA = np.asarray([0.299, 0.587, 0.114])  # of encoded color, Rec. 601
 _BYTES_PER_SPLAT = 2500.0  # while they are spread, measured: 1.2 GB for 683,549
 _BYTES_PER_CORNER = 300.0  # of a mesh, on its way from the file to splats
-_FARTHEST, _MOST_TILES = 1e12, 1e6  # units, beyond which areas overflow; repeats of a texture
+# Largest coordinate (areas overflow beyond), units; most repeats of a texture.
+_FARTHEST, _MOST_TILES = 1e12, 1e6
 _BORDER = 1e-3  # of a texture: coordinates may be off by this much
 _ENDS = re.compile(rb'"wrap[ST]" *: *(33071|33648)')  # a texture of glTF that does not repeat
 

@@ -71,7 +71,7 @@ def read_splats(
     | `specular`, `roughness` | factors on the specular strength and roughness of the material |
     | `weight_1_1`, `weight_1_2`, ... | factors on the material's weights: Gaussian, channel |
 
-    Other properties and elements are ignored. A file with faces and without radii causes a warning,
+    Other properties and elements are ignored. A file with faces and without radii is an error,
     because a mesh should be sampled (`sample_mesh`).
 
     The ellipsoids of a Gaussian-splatting scene (`f_dc_0`, `scale_0`, `rot_0`, ..., or an SPZ file,
@@ -224,7 +224,7 @@ class SplatFile:
 def _splat_fields(
     path: Path, columns: Mapping[str, np.ndarray], mm_per_unit: float, up: str
 ) -> dict[str, Any]:
-    """Return the fields of splats that columns hold, in mm and with +y up; `None` for others.
+    """Convert columns to fields of splats, in mm and with +y up; missing fields are `None`.
 
     **Raises:** `ValueError` for values that are not finite, or invalid for splats.
     """

@@ -110,7 +110,7 @@ def material_of_scene(file: Table) -> StrPath | Table:
 
 
 def mesh_of_scene(file: Table) -> Mesh | None:
-    """Return the triangles, mm, of which the splats in a scene's file are samples, if any."""
+    """Return the mesh (mm) from which the splats in a scene's file are sampled, or `None`."""
     table = file.table("splats", _BODY)
     if "file" in table.entries:
         return None

@@ -1,5 +1,5 @@
-"""Files read by trimesh. Contents that it would misread are detected first, its exceptions become
-one sentence, and ignored contents a warning.
+"""Files read by trimesh. Contents that trimesh would misread are detected first; its exceptions
+become one-sentence errors, and ignored contents cause a warning.
 """
 
 import json
@@ -26,8 +26,8 @@ _GLTF = rb"""
     |"image/(?!png"|jpeg"|webp")[^"]*"
     |"baseColorTexture"\s*:\s*{[^{}]*(?:"texCoord"\s*:\s*[1-9]|{\s*"KHR_texture_transform")
     """
-# What trimesh passes over or takes for something else: compressed, moved and several textures,
-# fans, curves, polygons without three corners, solids without end.
+# Contents that trimesh ignores or misreads: compressed, transformed and multiple textures, fans,
+# curves, polygons without three corners, and solids without an end.
 _UNREAD = {
     "gltf": re.compile(_GLTF, re.VERBOSE),
     "obj": re.compile(
@@ -120,9 +120,9 @@ def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
 
     Missing or unreadable pictures and materials are ignored with a warning.
 
-    **Returns:** the arguments of its meshes, as the file has them; its `contents`; `triangles`,
-    how many it promises, where it does; and of a PLY file `columns`, the properties of each
-    element.
+    **Returns:** the arguments of its meshes, as in the file; `contents`, the bytes of the file;
+    `triangles`, the announced number, or `None`; and `columns`, the properties of each element of a
+    PLY file.
 
     **Raises:** `ValueError` for contents that trimesh would misread, and when it reads fewer rows
     than a PLY file promises.

@@ -30,7 +30,7 @@ from ._lights import write_image
 from ._materialx import openpbr_inputs
 
 _SUFFIXES = (".usda", ".usdc", ".usd")
-_FOCAL_LENGTH = 50.0  # of a camera whose aperture follows
+_FOCAL_LENGTH = 50.0  # focal length of the camera; the aperture follows from it
 _FARTHEST = 1e3  # m, that a camera sees
 
 

@@ -1,6 +1,6 @@
-"""Light transport in a half space by adding and doubling, reflection and transmission of layers
-between discrete cosines: the fraction of light that leaves, by the angle of entry, and the law of
-angles of a material.
+"""Light transport in a half space by adding and doubling the reflection and transmission of layers
+between discrete cosines: the fraction of light that leaves, by angle of entry, and the angular law
+of a material.
 """
 
 from collections.abc import Callable
@@ -82,8 +82,8 @@ class AngularLaw(eqx.Module):
 
 @record
 class HalfSpace(eqx.Module):
-    r"""How much of the light that enters a half space leaves it again, by its angle: computed by
-    light transport, without the diffusion approximation.
+    r"""The fraction of the light entering a half space that leaves it again, by angle of entry,
+    from light transport without the diffusion approximation.
 
     Adding and doubling: the reflection and transmission of a layer between discrete cosines give
     those of two such layers, and so on to a half space. The surface is added last; it reflects from
@@ -173,7 +173,8 @@ class HalfSpace(eqx.Module):
         """Compute a fraction by reduced albedo, index, g, and the cover's albedo and depth."""
         medium, cover = self.medium, self.cover
         layer = cover and (cover.medium.albedo_prime, cover.medium.sigma_t_prime * cover.thickness)
-        # One after the other: with all at once, XLA never ends a program in which a fit follows.
+        # One channel at a time: with all at once, XLA never finishes compiling a program that also
+        # contains a fit.
         inputs = medium.albedo_prime, medium.eta, self.g, layer
         return jax.lax.map(lambda channel: fraction(*channel), inputs)
 
@@ -209,7 +210,7 @@ def _similarity_of_color(
         color, eta, g, white = constants
         return _diffuse_albedo(1 - similarity * similarity, eta, g) / white - color
 
-    # White is 1 to rounding.
+    # Without absorption, the color is 1 except for rounding.
     constants = color, eta, g, _diffuse_albedo(jnp.ones_like(color), eta, g)
     ends = {"lower": jnp.zeros_like(color), "upper": jnp.full_like(color, 1 - 1e-6)}
     solver, start = optx.Bisection(rtol=0, atol=0), 0.5 * ends["upper"]
@@ -230,8 +231,8 @@ def _directional_albedo(albedo_prime, eta, g, cover=None) -> Float[Array, " angl
         between = jnp.linalg.solve(identity - back @ half_space, transmitted)
         half_space = back + transmitted @ half_space @ between
 
-    # Adding the surface: by reciprocity, the fraction that leaves of light from one direction is
-    # the fraction of light from all directions that leaves in that direction.
+    # Adding the surface: by reciprocity, the fraction of light from one direction that leaves
+    # equals the fraction of light from all directions that leaves in that direction.
     leaving = jnp.linalg.solve(
         identity - half_space * reflected[None], half_space @ (1 - reflected)[:, None]
     )
@@ -283,8 +284,8 @@ def _diffuse_albedo(albedo_prime, eta, g, cover=None) -> Float[Array, ""]:
 
 
 def _directions(eta: Float[Array, ""]):
-    """Return cosines inside, their weights, and the reflectance of the surface met from inside:
-    refracted ones, of `HalfSpace.cosines`, and those beyond the critical angle.
+    """Return the cosines inside, their weights, and the internal reflectance of the surface: first
+    for the refracted `HalfSpace.cosines`, then for cosines beyond the critical angle.
     """
     nodes, node_weights = unit_legendre(_OUTSIDE)
     outside = jnp.asarray(HalfSpace.cosines(), eta.dtype)
@@ -305,8 +306,8 @@ def _directions(eta: Float[Array, ""]):
 
 
 def _redistribution(mu, weights, albedo_prime, g):
-    """Return the phase function's even and odd moments, between all cosines and times their
-    weights; and the albedo and the reduced extinction, the forward peak taken as unscattered.
+    """Return the even and odd parts of the phase function between all cosines, times their weights;
+    and the albedo and the reduced extinction, with the forward peak counted as unscattered.
     """
     polynomials = [jnp.ones_like(mu), mu]
     for n in range(1, _MOMENTS - 1):

@@ -224,8 +224,8 @@ class EganFresnel(AbstractFresnel):
 def reflectance(
     inside: Float[Array, "*shape"], outside: Float[Array, "*shape"], eta: Float[Array, "*shape"]
 ) -> Float[Array, "*shape"]:
-    """Compute the reflectance for unpolarized light from its cosines on either side of a smooth
-    interface, from either side.
+    """Compute the reflectance of a smooth interface for unpolarized light from its cosines on both
+    sides; it is the same from either side.
     """
     across = (eta * inside - outside) / (eta * inside + outside)
     along = (inside - eta * outside) / (inside + eta * outside)

@@ -193,7 +193,7 @@ class TestRecover:
     def test_one_picture_of_unknown_strength_does_not_fix_both_coefficients_and_a_second_one_does(
         self,
     ):
-        noise = 2.5 * NOISE
+        noise = 5 * NOISE
         (_, alone), splats = observations(taken()[1], noise), taken()[0]
         found = sj.inverse.recover(
             [alone], splats, medium(1.5, 0.7), count=COUNT, settings=PLAIN, model=DIPOLE
