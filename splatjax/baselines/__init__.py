@@ -1,4 +1,4 @@
-"""Methods to compare splat-based diffusion with, and measures of the comparison."""
+"""Methods for comparison with splat-based diffusion, and measures of the comparison."""
 
 from ._bust import bust_with_textures as bust_with_textures
 from ._blending import BlendingRasterizer as BlendingRasterizer

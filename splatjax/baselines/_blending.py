@@ -1,4 +1,4 @@
-"""Blended splats, by any kernel: attributes of the fragments of the front, normalized (Eq. 1)."""
+"""Splats blended by any kernel: normalized attributes of the front fragments (Eq. 1)."""
 
 import jax
 import jax.numpy as jnp

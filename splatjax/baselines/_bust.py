@@ -8,8 +8,8 @@ from ._mesh_raster import Landing, capacity_for
 from ._texture_space import rasterize_in_texture
 from ._textured_mesh import TexturedMesh
 
-_NECK = -105.0  # mm: below it the chart would show the shoulders over the chest
-_RIM = 0.002  # of the texture, that stays free along its edges
+_NECK = -105.0  # mm; below this height, shoulders and chest would overlap in the chart
+_RIM = 0.002  # fraction of the texture that stays free along each edge
 
 
 def bust_with_textures(texels: int) -> tuple[Mesh, Textures]:

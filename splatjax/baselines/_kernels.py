@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Float
 from splatjax.scene import Splats
 from splatjax.splatting import AbstractView, Footprints, SplattingSettings, fragment_weight
 
-_NO_FILTER = 1e-3  # pixels: a footprint needs some width
+_NO_FILTER = 1e-3  # pixels; the width of a footprint must be positive
 
 
 class Fragments(eqx.Module):
-    """Of some splats in some pixels."""
+    """Fragments of splats in pixels."""
 
     weight: Float[Array, "..."]
     """0 where a splat has no fragment."""
@@ -24,8 +24,8 @@ class Fragments(eqx.Module):
 
 
 class AbstractSplatKernel(eqx.Module):
-    """The footprint of a splat. All use the weight `splatjax.splatting.fragment_weight`, of a
-    squared radius.
+    """The footprint of a splat. The weight of all kernels is `splatjax.splatting.fragment_weight`
+    of a squared radius.
     """
 
     @abc.abstractmethod
@@ -43,15 +43,15 @@ class AbstractSplatKernel(eqx.Module):
         dy: Float[Array, "..."],
         nearness: Float[Array, "..."],
     ) -> Float[Array, "..."]:
-        """Compute `rho^2` at offsets from the center (pixels); 1 or more where a splat leaves
-        nothing.
+        """Compute `rho^2` at offsets from the center (pixels); 1 or more where a splat has no
+        fragment.
         """
 
     def nearness(
         self, f: Footprints, view: AbstractView, dx: Float[Array, "..."], dy: Float[Array, "..."]
     ) -> Float[Array, "..."]:
-        """Compute the nearness of the splat's plane: where the ray hits it, as everywhere in this
-        renderer.
+        """Compute the nearness of the point where the ray hits the splat's plane, as everywhere in
+        this renderer.
         """
         return f.nearness + f.slope_x * dx + f.slope_y * dy
 
@@ -83,7 +83,7 @@ class DiscKernel(AbstractSplatKernel):
 
 class EwaKernel(AbstractSplatKernel):
     r"""The elliptical weighted average: the disc's Gaussian, projected by the affine map at its
-    center, blurred by the pixel's.
+    center and blurred by the pixel's filter.
 
     In the picture the kernel is similar to `exp(-d^T (J V J^T + I)^-1 d / 2)`, where `I` is the
     variance of the pixel's filter, and is cut off where the renderer's kernel ends. The projection
@@ -91,7 +91,7 @@ class EwaKernel(AbstractSplatKernel):
 
     **Attributes:**
 
-    - `filter_variance`: of the pixel's filter, pixels squared. Static.
+    - `filter_variance`: variance of the pixel's filter, pixels squared. Static.
 
     **Source:** Zwicker et al. 2001, "Surface Splatting", section 4.2; Heckbert 1989, "Fundamentals
     of Texture Mapping and Image Warping".
@@ -127,13 +127,12 @@ class DiscOrPixelKernel(AbstractSplatKernel):
     r"""The disc in exact perspective, or a circle of a pixel's size around its center, whichever
     has the larger weight.
 
-    `rho^2 = min(rho_disc^2, d^2 / 2)`: an approximation of the elliptical weighted average that
-    leaves no splat smaller than a pixel, at the price of weights that are not those of a
-    convolution.
+    `rho^2 = min(rho_disc^2, d^2 / 2)`: an approximation of the elliptical weighted average in which
+    no splat is smaller than a pixel, but whose weights are not those of a convolution.
 
     **Attributes:**
 
-    - `pixel_radius`: of the circle, pixels. Static.
+    - `pixel_radius`: radius of the circle, pixels. Static.
 
     **Source:** Botsch et al. 2005, "High-Quality Surface Splatting on Today's GPUs", section 5.
     """

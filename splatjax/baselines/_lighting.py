@@ -27,8 +27,8 @@ class LightAtPixels(AbstractLighting):
     """Blends normals and all other attributes of splats, and lights each pixel by the blended
     attributes.
 
-    **Source:** Botsch et al. 2005, "High-Quality Surface Splatting on Today's GPUs", section 4; so
-    did Zwicker et al. 2001.
+    **Source:** Botsch et al. 2005, "High-Quality Surface Splatting on Today's GPUs", section 4;
+    also Zwicker et al. 2001.
     """
 
     def at_pixels(self, scene, groups, samples):
@@ -40,8 +40,8 @@ class PhongSplats(Splats):
 
     **Attributes:**
 
-    - `slopes`: derivative of the normal of each splat, 1/mm, a matrix of 3 x 3. From
-      `normal_slopes`, or of the surface's curvature. Differentiable.
+    - `slopes`: derivative of the normal of each splat, 1/mm, a 3 x 3 matrix, from `normal_slopes`
+      or from the curvature of the surface. Differentiable.
     """
 
     slopes: Float[Array, "splats 9"] = eqx.field(kw_only=True)
@@ -90,8 +90,8 @@ def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "
     - `neighbors`: number of neighbors; those on the far side of a thin part, which face away, do
       not count.
 
-    **Returns:** zero along the splat's own normal, and where the neighbors lie in one line, across
-    it.
+    **Returns:** the slopes; zero along the splat's own normal, and across the line of the neighbors
+    if these lie on one line.
     """
     centers, normals = (np.asarray(rows, float) for rows in (splats.centers, splats.normals))
     near = scipy.spatial.KDTree(centers).query(centers, k=min(neighbors + 1, len(centers)))[1][

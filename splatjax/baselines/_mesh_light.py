@@ -23,7 +23,7 @@ from ._textured_mesh import TexturedMesh
 
 
 class MeshShadow(eqx.Module):
-    """What one light sees of a mesh."""
+    """A mesh as seen from one light."""
 
     light: AbstractLightSample
     depths: _splatting.ShadowMap
@@ -81,7 +81,7 @@ def light_views(
 def shadow_capacities(
     mesh: TexturedMesh, lights: tuple[AbstractLightSample, ...], settings: _splatting.ShadowSettings
 ) -> tuple[int | None, ...]:
-    """Return the capacity that each light's shadow map needs; of concrete lights.
+    """Return the capacity that each light's shadow map needs; lights must be concrete.
 
     **Raises:** `ValueError` for a point light that casts shadows from within the mesh's bounding
     sphere.
@@ -108,8 +108,8 @@ def mesh_light(
     settings: _splatting.ShadowSettings,
     capacities: tuple[int | None, ...],
 ) -> MeshLight:
-    r"""Make the shadow maps of a mesh (4.1, of triangles). Differentiable in depth, not in
-    visibility.
+    r"""Make the shadow maps of a mesh (section 4.1, but of triangles). Differentiable in depth, not
+    in visibility.
 
     **Arguments:**
 

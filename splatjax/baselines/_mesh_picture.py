@@ -89,8 +89,8 @@ def render_texture_space(
     - `lights`, `material`, `camera`: as for `splatjax.render`. Differentiable.
     - `plan`: from `plan_texture_space`; needed under `jit`, `grad` and `vmap`, made here otherwise.
 
-    **Returns:** a `TextureSpacePicture` in the dtype of `mesh.vertices`; NaN where the plan does
-    not suffice, and `overflow` of its frame is above 0.
+    **Returns:** a `TextureSpacePicture` in the dtype of `mesh.vertices`; if the plan's capacity is
+    exceeded, it is NaN, and `overflow` of its frame is above 0.
 
     **Raises:** `ValueError` when a plan is needed and not given, or as `plan_texture_space` does.
 
@@ -142,7 +142,7 @@ def _shaded(
     view: _splatting.PerspectiveView,
     needed: Float[Array, ""],
 ) -> Frame:
-    """Shade what a camera sees, as pass 5 does."""
+    """Shade the visible points, as pass 5 does."""
     points, channels = seen.points, layers.shape[2]
     received: LightVisibility = light.on(points)
     f0 = _shading.fresnel_f0(material.eta)

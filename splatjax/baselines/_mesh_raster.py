@@ -19,13 +19,13 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax._chunking import with_spare
 from splatjax.splatting import AbstractView, PerspectiveView
 
-# of a face's extent, by which it is larger: a pixel on an edge belongs to both faces, never to none
+# Fraction of its extent by which a face is enlarged: a pixel on an edge belongs to both faces.
 _ON_THE_EDGE = 1e-4
-_AS_NEAR = 1e-6  # of the depth, within which the face of the higher number is seen
+_AS_NEAR = 1e-6  # of the depth; among faces this close, the one with the highest number is visible
 
 
 class Landing(eqx.Module):
-    r"""Where the corners of faces land in a picture.
+    r"""The positions of the corners of faces in a picture.
 
     **Attributes:** (differentiable)
 
@@ -86,18 +86,16 @@ class Landing(eqx.Module):
 
 
 class SeenFaces(eqx.Module):
-    """The face that every pixel sees; 0 where it sees none."""
+    """The visible face at every pixel; 0 where there is none."""
 
     faces: Int[Array, "height width"]
     covered: Bool[Array, "height width"]
     needed: Float[Array, ""]
-    """Fragments over the capacity for them: above 1 some are missing."""
+    """Number of fragments divided by their capacity; above 1, some are missing."""
 
 
 def capacity_for(landing: Landing) -> int:
-    """Return the capacity that `see_faces` needs for a concrete landing, and an eighth more for
-    motion.
-    """
+    """Return the capacity of `see_faces` for a concrete landing, plus an eighth for motion."""
     _, _, across, down = landing.boxes()
     return with_spare("fragments", 9 * int(jnp.sum(across * down)) // 8, 1024)
 
@@ -111,7 +109,7 @@ def see_faces(landing: Landing, capacity: int) -> SeenFaces:
     **Arguments:**
 
     - `landing`: from `Landing.in_view` or `Landing.in_texture`.
-    - `capacity`: how many pixels all boxes may have together (`capacity_for`). Static.
+    - `capacity`: most pixels of all boxes together (`capacity_for`). Static.
 
     **Returns:** `SeenFaces`.
     """
@@ -147,7 +145,7 @@ def barycentrics(landing: Landing, seen: SeenFaces) -> Float[Array, "height widt
     """Compute the perspective-correct barycentric coordinates at every pixel center, with sum 1.
     Differentiable in the landing.
 
-    Without a visible face they are those of a face's middle.
+    Without a visible face, each is 1/3.
     """
     row, column = jnp.indices((landing.height, landing.width), dtype=jnp.int32)
     interpolated = _barycentrics(

@@ -1,4 +1,4 @@
-"""The point-based methods with which the paper compares itself, as settings of this renderer."""
+"""The point-based methods that the paper compares with its own, as settings of this renderer."""
 
 from dataclasses import replace
 
@@ -26,9 +26,9 @@ def elliptical_points(settings: RenderSettings = RenderSettings()) -> RenderSett
 
 def ewa_splatting(settings: RenderSettings = RenderSettings()) -> RenderSettings:
     """Return settings that splat surfaces with the elliptical weighted average: the splat's kernel
-    blurred by the pixel's.
+    is blurred by the pixel's filter.
 
-    The projection is affine; where splats are large in the picture and the perspective strong,
+    The projection is affine; where splats are large in the picture and the perspective is strong,
     small holes open. Shading is per pixel.
 
     **Source:** Zwicker et al. 2001, "Surface Splatting".
@@ -40,8 +40,8 @@ def phong_splatting(settings: RenderSettings = RenderSettings()) -> RenderSettin
     """Return settings for Phong splatting: normals vary linearly within each splat, and nothing is
     filtered in the picture.
 
-    Few splats suffice for a smooth surface; splats smaller than a pixel alias. The scene holds
-    `PhongSplats`.
+    Few splats suffice for a smooth surface; splats smaller than a pixel alias. The scene must
+    contain `PhongSplats`.
 
     **Source:** Botsch et al. 2004, "Phong Splatting".
     """

@@ -18,12 +18,12 @@ from ._blur import Trust, blur_along
 
 _SUPPORT = 3.75  # standard deviations of a Gaussian
 _FOLLOWED = (
-    3.0  # standard deviations of a Gaussian in depth, beyond which a pixel is of another surface
+    3.0  # standard deviations of a Gaussian in depth, beyond which a pixel is on another surface
 )
 
 
 class AbstractScreenKernel(eqx.Module):
-    """A blur in screen space. The pixel's own light replaces that at pixels of another depth."""
+    """A blur in screen space. Pixels at another depth are replaced by the pixel's own light."""
 
     @abc.abstractmethod
     def diffuse(
@@ -92,7 +92,7 @@ class ShippedKernel(AbstractOneKernel):
     """The kernel that ships with "Separable subsurface scattering": the radial profile at the taps
     (`splatjax.exports`).
 
-    Two blurs by it are the profile for one Gaussian alone.
+    Two blurs by it give the profile only if that is a single Gaussian.
 
     **Source:** Jimenez et al. 2015, and the code that comes with it.
     """
@@ -141,7 +141,7 @@ def diffuse_on_screen(
       normal and position are read. Differentiable.
     - `camera`, `material`: those of the frame. Specular parameters are those of the material: maps
       of `specular` and `roughness` are not among the buffers.
-    - `kernel`: of the blur.
+    - `kernel`: kernel of the blur.
 
     **Returns:** the frame with other `layers`, `weights`, `diffuse` and `beauty`.
 

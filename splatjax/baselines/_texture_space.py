@@ -19,7 +19,7 @@ from ._mesh_raster import Landing, see_faces
 from ._textured_mesh import SurfaceTexels, TexturedMesh, look_up_charts, surface_texels
 from ._translucent import AbstractThinParts, FarSide, TranslucentShadowMap
 
-# share of the texels whose blur is as wide as required; what is wider than theirs is cut
+# Fraction of the texels whose blur has the full width; wider blurs are cut off.
 _WIDEST = 0.995
 _SUPPORT = 3.75  # standard deviations
 
@@ -34,7 +34,7 @@ class AbstractStretch(eqx.Module):
         along_v: Float[Array, "height width"],
         valid: Float[Array, "height width"],
     ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
-        """Convert a texel's extent along u and v, mm, to that which the blur uses."""
+        """Convert a texel's extent along u and v, mm, to the extent that the blur uses."""
 
 
 class StretchCorrected(AbstractStretch):
@@ -61,8 +61,8 @@ class TextureSpaceSettings(eqx.Module):
     - `stretch`: `StretchCorrected()` or `Uncorrected()`.
     - `thin_parts`: `TranslucentShadowMap()` or `OpaqueParts()`.
     - `kernel`: as in pass 4; the depth of the sources affects only the far side.
-    - `shadows`: of the lights' shadow maps; their bias is in pixels of the map, since texels have
-      no radius.
+    - `shadows`: settings of the lights' shadow maps; the bias is in pixels of the map, since texels
+      have no radius.
     """
 
     resolution: int = eqx.field(static=True, default=1024)
@@ -80,9 +80,9 @@ class TextureLayers(eqx.Module):
     - `layers`: one per Gaussian, as `L_k` of pass 4; 0 between the charts.
     - `valid`: 1 on the charts.
     - `entering`: the light before it spreads.
-    - `renormalized`: per Gaussian, the mean fraction of its weight between the charts and beyond
-      the texture. Light is not lost there, and does not cross seams.
-    - `needed`: needed over planned capacity; above 1 the plan does not suffice.
+    - `renormalized`: per Gaussian, the mean fraction of its weight that lies between the charts or
+      beyond the texture. This light is not lost, but does not cross seams.
+    - `needed`: needed over planned capacity; above 1, the plan's capacity is exceeded.
     """
 
     layers: Float[Array, "gaussians height width channels"]
@@ -99,9 +99,7 @@ def rasterize_in_texture(mesh: TexturedMesh, resolution: int, capacity: int) -> 
 
 
 def stretch_map(mesh: TexturedMesh, texels: SurfaceTexels) -> Float[Array, "2 height width"]:
-    """Compute the extent of every texel along u and v, mm; that of an average one between the
-    charts.
-    """
+    """Compute every texel's extent along u and v, mm; between the charts, the average extent."""
     seen = texels.seen
     along = jnp.stack(mesh.lengths())[:, seen.faces] / seen.faces.shape[0]
     valid = seen.covered.astype(along.dtype)

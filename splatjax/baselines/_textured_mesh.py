@@ -14,7 +14,7 @@ from splatjax.splatting import Bounds
 
 from ._mesh_raster import Landing, SeenFaces, barycentrics
 
-_OUTSIDE = 1e-6  # of the texture, that coordinates may reach beyond it
+_OUTSIDE = 1e-6  # how far coordinates may reach beyond the texture
 
 
 class TexturedMesh(eqx.Module):
@@ -108,12 +108,12 @@ class SurfaceTexels(eqx.Module):
     seen: SeenFaces
 
     def picture(self, values: Float[Array, "points *rows"]) -> Float[Array, "height width *rows"]:
-        """Lay values out as the picture."""
+        """Arrange values as a picture."""
         return values.reshape(*self.seen.faces.shape, *values.shape[1:])
 
 
 def surface_texels(mesh: TexturedMesh, landing: Landing, seen: SeenFaces) -> SurfaceTexels:
-    """Interpolate position, normal and textures of what every pixel of a landing sees.
+    """Interpolate position, normal and textures at the visible point of every pixel of a landing.
     Differentiable in the mesh and the landing.
 
     Where a pixel sees nothing, position and normal are 0.
@@ -154,7 +154,7 @@ def surface_points(
 def look_up(
     picture: Float[Array, "h w *channels"], uvs: Float[Array, "points 2"]
 ) -> Float[Array, "points *channels"]:
-    """Look a picture up at texture coordinates (v up), bilinearly between the centers of its
+    """Look up a picture at texture coordinates (v up), bilinearly between the centers of its
     pixels, repeating it.
     """
     height, width = picture.shape[:2]

@@ -21,7 +21,7 @@ from splatjax.scene import Splats
 
 _GOLDEN = (5**0.5 - 1) / 2
 _EVEN = 0.2  # fitted on the bust: docs/figures.md
-_POINTS = 512  # at which the contrast is measured
+_POINTS = 512  # number of points at which the contrast is measured
 _AT_ONCE = 8
 
 
@@ -53,7 +53,7 @@ class ThinnedPlan(AbstractDiffusionPlan):
     def diffuse(self, sources, variances, kernel, combination, at=None):
         everywhere = combination.gather(sources, axis=-1)
         group = np.arange(-(-everywhere.areas.shape[0] // self.keep))
-        # The first of each group would be on the same side of all groups.
+        # The first splat of each group would lie on the same side of every group.
         chosen = group * self.keep + (group * _GOLDEN % 1 * self.keep).astype(int)
         chosen = np.minimum(chosen, everywhere.areas.shape[0] - 1)
         kept = jax.tree.map(lambda rows: rows[..., chosen], everywhere)
@@ -70,8 +70,8 @@ def thinning_error(
     ratio: Float[Array, "..."],
     contrast: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Estimate the error of a layer from a part of the splats, evenly spread: root mean square,
-    relative to that of the layer.
+    r"""Estimate the error of a layer computed from a fraction of the splats, evenly spread: its
+    root mean square divided by the layer's.
 
         E = 0.2 s x^(3/2) (1 - q)^(1/2),    x = (h / sigma) q^(-1/2)
 
@@ -85,9 +85,9 @@ def thinning_error(
 
     **Arguments:**
 
-    - `width`: of the layer, the root of its variance, mm.
-    - `spacing`: of all splats, the root of their mean area, mm.
-    - `ratio`: of kept splats, in (0, 1].
+    - `width`: width of the layer, `sigma`, the root of its variance, mm.
+    - `spacing`: spacing of all splats, `h`, the root of their mean area, mm.
+    - `ratio`: fraction of splats that are kept, `q`, in (0, 1].
     - `contrast`: `s`, from `layer_contrast`.
 
     **Returns:** within a factor of 1.5 of measurements, in 99% of 234 layers with `x` up to 2.2
@@ -105,7 +105,7 @@ def splats_that_suffice(
     error: Float[Array, "..."],
     contrast: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Compute the ratio of splats for an error of a layer: the inverse of `thinning_error`.
+    r"""Compute the fraction of splats that gives a layer an error: the inverse of `thinning_error`.
 
     The root `(1 - q)^(1/2)` is replaced by 1, so the ratio is slightly too large if most are kept.
 

@@ -1,4 +1,6 @@
-"""Lists of splats per tile, processed block by block in the plainest way, with every derivative."""
+"""Lists of splats per tile, processed block by block in the simplest way, and differentiable
+throughout.
+"""
 
 import abc
 from collections.abc import Callable
@@ -33,8 +35,8 @@ Result = TypeVar("Result", bound=PyTree)
 
 
 class AbstractListRasterizer(AbstractRasterizer):
-    """Passes 2 and 3 by a kernel, over lists of splats. Shadow maps are the renderer's: baselines
-    differ only in the picture.
+    """Passes 2 and 3 by a kernel, over lists of splats. Shadow maps are rendered as in the renderer
+    itself, so that baselines differ only in the picture.
     """
 
     kernel: eqx.AbstractVar[AbstractSplatKernel]
@@ -46,7 +48,7 @@ class AbstractListRasterizer(AbstractRasterizer):
             )
         counts = [_demand(self.kernel, parts[0], view, settings) for view in views]
         grid = TileGrid(views[0].width, views[0].height)
-        # Blocks of the longest list of each chunk: the lists of a chunk take as many each.
+        # Blocks of the longest list of each chunk; every list of the chunk takes as many.
         longest = [np.sort(grid.blocks(tiles))[::-1][:: grid.lanes] for tiles in counts]
         blocks = with_spare(("blocks", grid), max(int(chunks.sum()) for chunks in longest), 4)
         return ListPlan(self, BinCapacity.for_counts(counts, grid), blocks)
@@ -97,14 +99,14 @@ class ListPlan(AbstractRasterPlan):
 
 
 class Lists(eqx.Module):
-    """The splats of every tile, in blocks of `[lanes, slots]`; the blocks of a chunk hold the lists
-    of the same tiles, and are numbered.
+    """The splats of every tile, in blocks of `[lanes, slots]`; the blocks of a chunk contain the
+    lists of the same tiles, and are numbered.
     """
 
     footprints: Footprints
     bins: Bins
     chunk: Int[Array, " blocks"]
-    """The number of chunks for a block that holds nothing."""
+    """Chunk of each block; the number of chunks for an empty block."""
     number: Int[Array, " blocks"]
     grid: TileGrid
 
@@ -142,7 +144,7 @@ class Lists(eqx.Module):
         return jax.lax.map(lambda block: map_block(*block), (self.chunk, self.number))
 
     def reduce_blocks(self, combine: Callable, results: jax.Array) -> jax.Array:
-        """Combine what the blocks of each chunk found, by a segment reduction: `[chunks, lanes,
+        """Combine the results of the blocks of each chunk by a segment reduction: `[chunks, lanes,
         ...]`.
         """
         chunks = self.bins.order.shape[0] // self.grid.lanes

@@ -12,8 +12,8 @@ from splatjax.splatting import TILE_SIDE, TileGrid
 from ._mesh_light import MeshLight, MeshShadow
 from ._textured_mesh import SurfaceTexels
 
-# standard deviations of a layer, in the texture, between two texels that the blur does not bring
-# together
+# Distance in the texture, in standard deviations of a layer, at which the blur no longer connects
+# two texels.
 _APART = 6.0
 
 
@@ -36,7 +36,7 @@ class FarSide(eqx.Module):
         variance: Float[Array, ""],
         depth: Float[Array, ""],
     ):
-        """Compute the weight of the far side against the texel's own surroundings in a layer,
+        """Compute the weight of the far side in a layer, relative to the texel's own surroundings,
         `[lights, points]`.
         """
         is_far = nearness > 0
@@ -59,7 +59,7 @@ class AbstractThinParts(eqx.Module):
         millimeters: Float[Array, ""],
     ) -> FarSide | None:
         """Find the far side of each texel; `widest` is the widest layer's standard deviation,
-        `millimeters` a texture's edge.
+        `millimeters` the average length of a texture's edge.
         """
 
 
@@ -115,7 +115,7 @@ class TranslucentShadowMap(AbstractThinParts):
         cosine = jnp.sum(wi * normals, axis=1)
         opposite = jnp.clip(-jnp.sum(entered[2:].T * normals, axis=1), 0, 1)
         thickness = way + opposite * (jnp.clip(-cosine, 0, 1) * way - way)
-        # In diagonals of a pixel: texels have no extent.
+        # The bias is in diagonals of a pixel, because texels have no extent.
         least = bias * 2**0.5 * view.pixel_size(depth)
         is_far = lit & (cosine < 0) & (depth > front[tile, pixel] + least)
         return entered[:2].T, jnp.where(is_far, jnp.exp(-thickness / scale), 0.0)

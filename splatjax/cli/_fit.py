@@ -31,7 +31,8 @@ from ._terminal import (
 )
 
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
-_LARGE, _APART = 0.05, 3.0  # errors, and ratios of widths, of channels that share badly
+# Error that is noted, and ratio of the channels' widths that explains it.
+_LARGE, _APART = 0.05, 3.0
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
 # Options that affect only one kind of input.
 _OPTIONS = {
@@ -68,14 +69,14 @@ class Fit:
     ]
     #: Number of Gaussians.
     count: int = 6
-    #: Largest error (Eq. 4) of any channel: use the least number of Gaussians, up to 12, that
-    #: reaches it, instead of --count.
+    #: Largest error (Eq. 4) of any channel. The fit then uses the least number of Gaussians that
+    #: reaches it, up to 12, instead of --count.
     error: OptionalFloat = None
     #: Model of the profile of coefficients: photon-beam (default), dipole, better-dipole or
     #: monte-carlo. Layers use the multipole, or monte-carlo.
     model: Annotated[Model | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="")] = None
     #: Mean cosine of Henyey and Greenstein's phase function, for photon beams and Monte Carlo. By
-    #: default that of the file, or 0.
+    #: default the value in the file, or 0.
     g: OptionalFloat = None
     #: Number of photons for Monte Carlo.
     photons: int = 1_000_000
@@ -100,7 +101,7 @@ class Fit:
     ] = False
     #: TOML file to write the material to.
     output: OptionalPath = None
-    #: Plot to write of profile, fit and error: .png, .pdf or .svg.
+    #: File for a plot of profile, fit and error: .png, .pdf or .svg.
     plot: OptionalPath = None
 
     def run(self) -> None:

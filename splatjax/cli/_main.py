@@ -1,5 +1,5 @@
 """Parse the command line, run a command, and report an error in one line; and decide what a library
-leaves to its program: where compiled code is kept, which device computes, how memory is reused.
+leaves to the program: the cache of compiled code, the device, and the reuse of memory.
 """
 
 import contextlib
@@ -51,7 +51,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
     **Arguments:**
 
-    - `args`: the words after `splatjax`; those of the process when not given.
+    - `args`: the words after `splatjax`; by default from the command line of the process.
 
     **Returns:** the exit status: 0 for success; 2 for invalid input and 1 for a fault of splatjax,
     both with one line on stderr; 130 when interrupted; 141 when stdout is a closed pipe.
@@ -115,7 +115,8 @@ def _message(error: Exception) -> tuple[str, int]:
     fault of splatjax.
     """
     text = str(error)
-    if isinstance(error, eqx.EquinoxRuntimeError):  # between a stack and advice to developers
+    # The message is between a stack and advice to developers.
+    if isinstance(error, eqx.EquinoxRuntimeError):
         text = text.rpartition("EquinoxRuntimeError: ")[2].partition("\n\n---")[0]
     line = " ".join(text.split())
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
@@ -148,13 +149,14 @@ def keep_freed_memory() -> None:
 
 
 def prepare_jax() -> None:
-    """Keep what takes long at the start in the user's cache folder, and compute on the CPU, unless
-    the environment decides otherwise.
+    """Cache slow parts of the start in the user's cache folder, and compute on the CPU, unless
+    environment variables specify otherwise.
 
     JAX's own variables, `JAX_COMPILATION_CACHE_DIR`, `JAX_PLATFORMS` and others, take precedence;
     `XDG_CACHE_HOME` moves the cache folder.
     """
     if jax.config.jax_platforms is None:  # ty: ignore[missing-attribute]
         jax.config.update("jax_platforms", "cpu")
-    with contextlib.suppress(OSError):  # without it, everything is made and compiled each time
+    # Without the folder, everything is made and compiled each time.
+    with contextlib.suppress(OSError):
         sj.cache.keep()

@@ -33,7 +33,7 @@ _SCENES = {
     ".usda": sj.io.save_usd,
     ".usdc": sj.io.save_usd,
 }
-_ACROSS = 8  # pictures on a sheet
+_ACROSS = 8  # pictures in a row of a sheet
 _WHITE = 1.0  # radiance
 
 
@@ -57,8 +57,8 @@ class Materials:
             help_behavior_hint="",
         ),
     ] = None
-    #: Also render each on the built-in bust, 7 cm tall, in the studio, and write them onto this
-    #: sheet, PNG or JPEG.
+    #: Also render each material on the built-in bust, 7 cm tall, in the studio, and write the
+    #: pictures to this sheet, PNG or JPEG.
     pictures: OptionalPath = None
 
     def run(self) -> None:

@@ -1,4 +1,4 @@
-"""What `splatjax fit` makes of coefficients: the models of `docs/which_profile.md` by name, fits of
+"""Fits of coefficients for `splatjax fit`: the models of `docs/which_profile.md` by name, fits of
 many media by one program for `--all`, and the report of a fit.
 """
 
@@ -24,7 +24,7 @@ _BEYOND = sj.fitting.TransportModel.rule
 
 
 def model_by_name(model: Model | None, g: float) -> sj.fitting.AbstractModel:
-    """Return the model of a half space that an option names; light transport unless given.
+    """Return the model of a half space named by an option; by default, light transport.
 
     **Raises:** `ValueError` for a mean cosine that the model does not take.
     """
@@ -37,7 +37,7 @@ def model_by_name(model: Model | None, g: float) -> sj.fitting.AbstractModel:
 
 @dataclass(frozen=True)
 class Reference:
-    """A profile to be fitted, and the radii at which its fit counts.
+    """A profile to be fitted, and the radii of the fit.
 
     **Attributes:**
 
@@ -69,9 +69,10 @@ def reference(
     - `model`: `None` is the photon beam with the total of light transport, or the multipole of
       layers.
     - `g`: mean cosine of the phase function.
-    - `single_scattering`: whether light that scatters once is taken out of the profile.
+    - `single_scattering`: whether light that scatters once is separated from the profile.
 
-    **Raises:** `ValueError` for options that do not go with the model or with layers.
+    **Raises:** `ValueError` for options that the model, or a material with layers, does not
+    support.
     """
     if isinstance(coefficients, sj.scattering.Skin):
         if model or g or single_scattering:
@@ -127,7 +128,7 @@ def _walked(
     g: float,
     single_scattering: bool,
 ) -> Reference:
-    """Walk in single precision, which suffices for photons; the profile is fitted in double."""
+    """Trace photons in single precision, which suffices; the fit uses double precision."""
     is_layered = isinstance(coefficients, sj.LayeredMultipole)
     layers = coefficients.layers if is_layered else [sj.Layer(coefficients.medium, jnp.inf)]
     layers_32 = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), list(layers))
@@ -178,8 +179,8 @@ def _fit_each(
 def fit_batch(
     coefficients: np.ndarray, count: int, model: sj.fitting.AbstractModel
 ) -> dict[str, np.ndarray]:
-    """Return the columns of a batch. A smaller batch is padded, so that one program serves all. The
-    starts of fits to dipoles are near the optima of other models of the same media.
+    """Fit a batch, and return its columns. A smaller batch is padded, so that one program serves
+    all. Fits start from the variances for dipoles, which are near the optima of the other models.
     """
     length = len(coefficients)
     padded = np.pad(coefficients, ((0, BATCH - length), (0, 0)), mode="edge")

@@ -26,7 +26,7 @@ from ._terminal import (
     stage,
 )
 
-# Of any translucent solid: diamond has 2.4.
+# Largest index of refraction of a translucent solid; diamond has 2.4.
 _LARGEST_ETA = 3.0
 _COEFFICIENTS = ("sigma_a", "sigma_s_prime")
 
@@ -41,7 +41,7 @@ class Recover:
 
         [[pictures]]
         file = "left.exr"
-        noise = 0.01             # over the picture's root mean square, if it is known
+        noise = 0.01             # relative to the picture's root mean square, if it is known
         intensity = "unknown"    # or "known", the default, or "unknown color"
         camera = { position = [0, 0, 500], target = [0, 0, 0], fov = 25 }
         [[pictures.lights]]
@@ -72,11 +72,11 @@ class Recover:
             "names, or paths of TOML files. The best result counts.",
         ),
     ] = ("skin1", "marble")
-    #: Index of refraction, which is not searched. By default that of the first start.
+    #: Index of refraction, which is not fitted. By default the index of the first start.
     eta: OptionalFloat = None
     #: TOML file to write the material to.
     output: Path = Path("recovered.toml")
-    #: Plot to write of the input, the recovered picture and the residual: .png, .pdf or .svg.
+    #: File for a plot of the input, the recovered picture and the residual: .png, .pdf or .svg.
     report: OptionalPath = None
     #: Model of the profile of the coefficients (docs/which_profile.md).
     model: Literal["photon-beam", "dipole", "better-dipole"] = "photon-beam"

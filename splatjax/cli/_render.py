@@ -21,8 +21,8 @@ from ._terminal import check_folder, check_options, check_output, complete, prev
 from ._view import PictureOptions
 
 _LARGEST = 16_383  # pixels along a side of a WebP file
-_MOST_FRAMES = 10_000  # that four digits can name
-_DIRECTIONS = 128  # of the shadows of an environment that turns about the body
+_MOST_FRAMES = 10_000  # the most that four digits can number
+_DIRECTIONS = 128  # number of shadow maps of an environment that turns about the body
 
 
 Rendered = tuple[sj.Frame, sj.Material, tuple[sj.scene.AbstractLight, ...], sj.Camera]
@@ -153,7 +153,7 @@ class Turntable(PictureOptions):
 
     Each frame is an EXR file with every layer and a PNG file; the animation turntable.webp plays in
     a browser. Frames start at --azimuth and the light's azimuth and continue in equal steps; a full
-    turn ends one step before its start, so that it can repeat. The splats are planned and the
+    turn ends one step before its first frame, so that it can repeat. The splats are planned and the
     program is compiled once for all frames. With --turn camera and no fill, the light below the
     surface is computed once too; for an environment that turns, shadow maps are rendered once.
     Existing frames are kept: after an interruption, run the same command again. A record in the
@@ -248,7 +248,7 @@ class Turntable(PictureOptions):
         if keeps_shadows:
             even = partial(replace, directions=sj.scene.even_directions(_DIRECTIONS))
             scenes = [replace(scene, lights=tuple(map(even, scene.lights))) for scene in scenes]
-        # The plan is for all frames, so that an interruption changes none.
+        # One plan serves all frames, so that an interruption does not change any.
         with stage(f"planning {self.frames} frames"):
             plan = sj.make_plan(scenes, cameras, settings)
         light = None
@@ -292,7 +292,7 @@ def rough_picture(
     even. Return rows of red, green and blue up to 255.
     """
     scene, camera, lights = jax.device_get((scene, camera, samples))
-    # Of millions of splats some will do.
+    # A part of millions of splats suffices.
     splats = jax.tree.map(lambda leaf: leaf[:: 1 + len(leaf) // 2**19], scene.splats)
     lengths = np.asarray([camera.width, camera.height])
     side = max(2, min(side, 0.5 * splats.count**0.5))  # so that few pixels have no splat
@@ -303,7 +303,7 @@ def rough_picture(
         for light in lights
     )
     local = (splats.centers - camera.position) @ camera.rotation.T
-    # From far to near, without those that face away: nearer ones are drawn over farther ones.
+    # Draw splats that face the camera from far to near: nearer ones cover farther ones.
     order = np.argsort(-local[:, 2])
     order = order[np.sum(local * (splats.normals @ camera.rotation.T), axis=1)[order] < 0]
     middle = size * np.asarray(camera.principal_pixel) / lengths

@@ -13,19 +13,21 @@ _BESIDE = {"splats", "output", "background", "exposure", "half", "quiet", "host"
 
 
 def camera_of(source: str, mm_per_unit: float, up: str, height: int, scale: float) -> sj.Camera:
-    """Read FILE or FILE:NAME; the picture has a height, and lengths are scaled with the body."""
+    """Read a camera from FILE or FILE:NAME, for a picture of given height, and scale it with the
+    body.
+    """
     path, _, name = ("", "", "0") if Path(source).exists() else source.rpartition(":")
     camera = sj.io.load_camera(path or source, name or "0", mm_per_unit=mm_per_unit, up=up)
     return replace(sj.io.resized(camera, height), position=camera.position * scale)
 
 
 def is_scene(path: Path) -> bool:
-    """Return whether a file describes a scene, or is a picture whose manifest is one."""
+    """Return whether a file is, by its suffix, a scene, or a picture whose manifest is a scene."""
     return path.suffix.lower() in (".toml", ".exr")
 
 
 def check_alone(options: Any) -> None:
-    """Raise `ValueError` for an option that a scene's file contains."""
+    """Raise `ValueError` for an option that the scene's file specifies."""
     for field in fields(options):
         value = getattr(options, field.name)
         if field.name not in _BESIDE and field.default not in (value, MISSING):
@@ -36,7 +38,7 @@ def check_alone(options: Any) -> None:
 
 
 def scene_of_options(options: Any, images: str | list[str], *record: Any) -> dict[str, Any]:
-    """Return a scene as its file would be, from options and the images of lights; `record` is as
+    """Return the contents of a scene's file, from options and the images of lights; `record` is as
     for `scene_in_folder`.
     """
     body = {"file": str(options.splats)} if options.splats else {"bust": options.count}
@@ -63,8 +65,9 @@ def scene_in_folder(
     lights: tuple[sj.scene.AbstractLight, ...],
     camera: sj.Camera,
 ) -> dict[str, Any]:
-    """Return a scene as its file in a folder would be, with files named from an old folder: of the
-    body, and an image of each light, or one for all; `g` is that of the material.
+    """Return the contents of a scene's file in a folder. The files of the body and the images, one
+    for each light or one for all, are named relative to an old folder; `g` is the material's mean
+    cosine.
     """
 
     def moved(name: str) -> str:

@@ -1,4 +1,4 @@
-"""`splatjax studio`: a scene in the browser, to turn and to change."""
+"""`splatjax studio`: turn and change a scene in the browser."""
 
 import threading
 import tomllib
@@ -18,7 +18,7 @@ from ._scene import check_alone, is_scene, scene_of_file, scene_of_options
 from ._terminal import OptionalPath, check_folder, stage
 from ._view import ViewOptions
 
-# With the source of the material.
+# Scene, camera, settings, the source of the material, and the function for the scene's file.
 Opened: TypeAlias = tuple[sj.Scene, sj.Camera, sj.RenderSettings, Any, AsFile]
 
 
@@ -43,10 +43,10 @@ class Studio(ViewOptions):
     #: TOML file that lists pictures, as for `splatjax recover`: the page takes the camera and the
     #: lights of the first, and offers to recover the material.
     pictures: OptionalPath = None
-    #: The address to listen at. At any address except 127.0.0.1, other computers that reach it can
+    #: The address to listen on. On any address except 127.0.0.1, other computers that reach it can
     #: change the scene and save files.
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    #: The port to listen at; if it is in use, the next free one.
+    #: The port to listen on; if it is in use, the next free port is used.
     port: int = 8080
 
     def run(self) -> None:
@@ -60,7 +60,7 @@ class Studio(ViewOptions):
             page.close()
 
     def page(self) -> Page:
-        """Return the page of the scene, which is open."""
+        """Open the page of the scene, and return it."""
         check_installed("the page of the studio", "viser")
         observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
         if self.splats is not None and is_scene(self.splats):

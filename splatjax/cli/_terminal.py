@@ -1,8 +1,8 @@
 """Common parts of the commands: types of options for the help; checks of options and outputs at the
 start; messages on stderr, with results on stdout; and long commands that write many files, which
-several processes share and the same command continues.
+several processes can share and the same command resumes.
 
-Explanations of more than a line are in `help`, because breaks in docstrings are kept.
+Explanations of more than a line are in `help`, because line breaks in docstrings are kept.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_beha
 UpAxis = Literal["y", "z"]
 # By field of a command: whether its value is valid, and the requirement.
 Rules = dict[str, tuple[bool, str]]
-# Suffixes of drawings.
+# Suffixes of figures.
 FIGURES = (".png", ".pdf", ".svg")
 CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -79,7 +79,7 @@ def note(message: str) -> None:
 def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
     """Report a stage of the work, and afterwards its time.
 
-    Yields the function to call with the finished steps of a total, and with the name of the stage
+    Yields a function that takes the number of finished steps, of a total, and the name of the stage
     if it changes. If stderr is not a terminal, it prints a line at most once a second.
     """
     begin = last = time.perf_counter()
@@ -102,7 +102,7 @@ def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
 @contextlib.contextmanager
 def preview(draw: Callable[[int], list]) -> Generator[None]:
     """Show a small picture when the first compilation starts, once, if stderr is a terminal with
-    colors. If all programs are cached, the requested picture is ready as soon.
+    colors. If all programs are cached, the requested picture is ready just as soon.
 
     **Arguments:**
 
@@ -138,7 +138,7 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
         print("  ".join(cells).rstrip())
 
 
-# Variables with the number of processes of a launcher; the first that is set counts.
+# Variables with the number of processes of a launcher; the first that is set is used.
 _COUNTS = "JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"
 
 
@@ -156,11 +156,11 @@ def complete(
 
     **Arguments:**
 
-    - `record_path`: of the record, in the folder of the files.
+    - `record_path`: path of the record, in the folder of the files.
     - `record`: the settings on which the files depend.
     - `items`: the files of each item.
     - `prepare`: called if an item is missing; returns the function that makes item i.
-    - `name`: of the items, in messages.
+    - `name`: name of the items, for messages.
     - `what`: the name of the work, for the message.
 
     **Returns:** all items, or those of this process if others are still at work.
@@ -217,8 +217,8 @@ def process_index_and_count() -> tuple[int, int]:
     """Wait for all processes of a launcher; return the index of this process and their number.
 
     JAX detects SLURM and Open MPI; elsewhere `JAX_COORDINATOR_ADDRESS`, `JAX_NUM_PROCESSES` and
-    `JAX_PROCESS_ID` give it. Afterwards each continues alone: a failure of one does not stop the
-    others. Call it before any computation.
+    `JAX_PROCESS_ID` specify them. Afterwards each process continues alone: a failure of one does
+    not stop the others. Call it before any computation.
 
     **Raises:** `ValueError` if the environment specifies several processes without the index of
     this one.

@@ -20,7 +20,7 @@ from ._terminal import OptionalFloat, Rules, UpAxis, check_options, note, option
 
 # Degrees: the fill is beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
-# Options of the single light, by their values where another of them is given.
+# Options of the single light, with their defaults if another of them is given.
 _SINGLE_LIGHT = {"light_azimuth": -20.0, "light_elevation": 30.0, "fill": 0.1}
 ENVIRONMENTS = sj.io.ENVIRONMENTS
 _NOT_IN_PICTURES = ("splats", "output", "fps", "quiet", "half", "camera_file", "camera_unit")
@@ -49,8 +49,8 @@ class ViewOptions:
     elevation: float = 0.0
     #: Vertical field of view.
     fov: float = 25.0
-    #: Azimuth of a single light that replaces the studio; beyond 90 it is behind. Default with
-    #: another option of the single light: -20.
+    #: Azimuth of a single light that replaces the studio; beyond 90, the light is behind the body.
+    #: Default with another option of the single light: -20.
     light_azimuth: OptionalFloat = None
     #: Elevation of the single light. Default with another option of the single light: 30.
     light_elevation: OptionalFloat = None
@@ -68,12 +68,12 @@ class ViewOptions:
     #: Let light spread below the surface. Without scattering it leaves where it enters.
     scattering: bool = True
     #: Model of the light below the surface: the profile of a flat surface (clusters); the same in
-    #: less time, with the sum of the layers alone in the EXR (exitance); or the diffusion equation
+    #: less time, with only the sum of the layers in the EXR (exitance); or the diffusion equation
     #: in the closed body, from the coefficients of the material (shape).
     diffusion: Literal["clusters", "exitance", "shape"] = "clusters"
     #: Number of times that light may leave the body and enter it again: 1 or 2 brighten folds.
     bounces: int = 0
-    #: Use the maps of the splats (of the bust: skin). Without them the material alone is seen.
+    #: Use the maps of the splats (for the bust, skin). Without them only the material is visible.
     albedo: bool = True
     #: Number of splats of the built-in bust.
     count: int = 200_000
@@ -215,7 +215,7 @@ class ViewOptions:
         if self._environment is not None:
             rotation = self.environment_rotation + light_azimuth - first_azimuth
             return (sj.EnvironmentLight(self._environment.image, rotation),)
-        # The first light gives a white diffuser that faces it the radiance 1.
+        # Under the first light, a white diffuser that faces it has radiance 1.
         irradiance = np.full(material.channels, np.pi)
         towards = -direction_to(light_azimuth, elevation)
         light = sj.DirectionalLight(direction=towards, irradiance=irradiance)
@@ -248,7 +248,7 @@ class ViewOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions(ViewOptions):
-    """What the files of a picture contain."""
+    """Options for the contents of a picture's files."""
 
     #: Background of the PNG: black, transparent, or the environment. The EXR has coverage and no
     #: background.
@@ -276,13 +276,13 @@ class PictureOptions(ViewOptions):
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
         picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
         record = self.record(path.parent, material, lights, camera)
-        summed = self.diffusion != "clusters"  # then the one layer is of no Gaussian
+        summed = self.diffusion != "clusters"  # the only layer then belongs to no Gaussian
         widths = None if summed else material.gaussians.variances.tolist()
         sj.write_exr(path, frame, variances=widths, manifest=record, camera=camera, half=self.half)
         if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
             shown = np.asarray(lights[0].behind(frame, camera))
         elif self.background == "transparent":
-            colors = np.repeat(shown, 3 // shown.shape[-1], axis=-1)  # of a scene in gray
+            colors = np.repeat(shown, 3 // shown.shape[-1], axis=-1)  # for a scene in gray
             shown = np.concatenate([colors, np.asarray(frame.coverage)[..., None]], axis=-1)
         sj.write_png(picture, shown, exposure=self.exposure)
         return path, picture

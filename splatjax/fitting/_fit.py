@@ -32,8 +32,8 @@ class ErrorByCount(eqx.Module):
     **Attributes:**
 
     - `error`: error of the best sums of 1, 2, ... Gaussians.
-    - `variances`: variances of these sums, mm^2, ascending; the unused last ones are infinite. With
-      `VariancesPerChannel`, for each channel.
+    - `variances`: variances of these sums, mm^2, ascending, padded with infinity. With
+      `VariancesPerChannel`, one set for each channel.
     """
 
     error: Float[Array, "counts channels"]
@@ -42,7 +42,7 @@ class ErrorByCount(eqx.Module):
     def least(self, error: float) -> int:
         r"""Find the least number of Gaussians with which no channel exceeds an error.
 
-        **Raises:** `ValueError` if no number suffices, and inside `jit`, where the answer depends
+        **Raises:** `ValueError` if no number suffices, or inside `jit`, because the answer depends
         on values.
         """
         if is_traced(self.error):
@@ -59,7 +59,7 @@ class ErrorByCount(eqx.Module):
         return int(np.argmax(worst <= error)) + 1
 
     def start(self, count: int) -> GivenVariances:
-        """Return the start of a fit of `count` Gaussians, which completes this search."""
+        """Return the start for a fit of `count` Gaussians that completes this search."""
         return GivenVariances(self.variances[..., count - 1, :count])
 
 
@@ -149,9 +149,9 @@ class FitResult(eqx.Module):
     covariance: Float[Array, "*channels parameters parameters"]
 
     def table(self) -> list[tuple[str, str]]:
-        """Return the Gaussians and their errors as rows: a name, and a number per channel; the
-        first row is the heading. With `VariancesPerChannel`, the Gaussians of one channel after the
-        other.
+        """Return the Gaussians and their errors as rows of a name and one number per channel; the
+        first row is the heading. With `VariancesPerChannel`, the Gaussians are listed channel by
+        channel.
         """
         weights = self.gaussians.weights.reshape(-1, self.gaussians.channels)
         names = ", ".join(channel_names(len(self.error)))
@@ -166,7 +166,7 @@ class FitResult(eqx.Module):
         ]
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the table."""
+        """Return the table as HTML, for notebooks."""
         rows = "".join(f"<tr><td>{name}</td><td>{row}</td></tr>" for name, row in self.table())
         return f"<table>{rows}</table>"
 
@@ -278,7 +278,7 @@ def fit_weights(
     **Arguments:**
 
     - `profile`: 1/mm^2. Differentiable, in forward and reverse mode.
-    - `variances`: mm^2, positive, all different. Constants of every derivative.
+    - `variances`: mm^2, positive, all different. Derivatives treat them as constants.
     - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, or `NonNegativeWeights(...)`,
       either of these without negative weights.
     - `rule`: radii of the integral, in length scales of the profile.

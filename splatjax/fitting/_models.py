@@ -1,5 +1,5 @@
-"""Models of the light of a medium: the profile, the quadrature of its fit, and the angles of its
-light; and fits of optical coefficients to a measured profile.
+"""Models of light in a medium: its profile, the quadrature of the fit, and the dependence on
+angles; and fits of optical coefficients to a measured profile.
 """
 
 import abc
@@ -63,7 +63,7 @@ class DiffusionModel(AbstractModel):
 
     **Attributes:**
 
-    - `kind`: computes from a medium a profile that is finite at the origin. Static.
+    - `kind`: computes the profile of a medium; it must be finite at the origin. Static.
     """
 
     kind: Callable[[Medium], AbstractProfile] = eqx.field(static=True, default=Dipole)
@@ -73,8 +73,8 @@ class DiffusionModel(AbstractModel):
 
 
 class TransportModel(AbstractModel):
-    r"""The default model: the photon beam, scaled to the total reflectance of light transport, and
-    with its angles of entry and exit (`HalfSpace`).
+    r"""The default model: the photon beam, with the total reflectance and the angular dependence of
+    light transport (`HalfSpace`).
 
         model = TransportModel(g=0.8)
         weights = NonNegativeWeights(FixedTotalReflectance())
@@ -86,8 +86,8 @@ class TransportModel(AbstractModel):
 
     **Attributes:**
 
-    - `g`: mean cosine of the phase function; one for all channels, or one for each.
-      Differentiable; jitted functions are compiled for each Python number, and once for arrays.
+    - `g`: mean cosine of the phase function; one for all channels, or one for each. Differentiable;
+      jitted functions are recompiled for each new Python number, but only once for arrays.
     """
 
     g: float | tuple[float, ...] | Float[Array, "..."] = 0.0
@@ -107,7 +107,8 @@ class TransportModel(AbstractModel):
 
 
 class SkinModel(AbstractModel):
-    r"""Skin from its pigments: its profile and angles by light transport, as colors.
+    r"""Skin computed from its pigments: profile and angles by light transport, in red, green and
+    blue.
 
         skin = Skin(melanin=0.03)
         model = SkinModel(io.spectrum_to_rgb(skin.wavelengths))
@@ -115,7 +116,7 @@ class SkinModel(AbstractModel):
 
     **Attributes:**
 
-    - `matrix`: from the wavelengths of the skin to red, green and blue. Differentiable.
+    - `matrix`: converts the wavelengths of the skin to red, green and blue. Differentiable.
     """
 
     matrix: Float[Array, "wavelengths colors"] = eqx.field(converter=numbers)
@@ -165,7 +166,7 @@ def weight_factors(
 
 @eqx.filter_jit
 def _fit_held(profile: AbstractProfile, variances: Float[Array, " gaussians"]):
-    """Fit weights that are not negative, of the profile's total reflectance."""
+    """Fit non-negative weights whose sum is the profile's total reflectance."""
     held = NonNegativeWeights(FixedTotalReflectance())
     return fit_weights(profile, variances, weights=held, rule=TransportModel.rule).weights
 
@@ -177,7 +178,7 @@ class MediumFit(eqx.Module):
 
     - `medium`: the most likely medium.
     - `covariance`: covariance of the logarithms of `sigma_a` and `sigma_s_prime`, per channel: its
-      diagonal has squared relative errors.
+      diagonal contains the squared relative errors.
     - `chi_squared`: sum of the squares of residuals divided by deviations, per degree of freedom:
       about 1 if model and deviations are right. If it is larger, multiply the error bars by its
       square root.

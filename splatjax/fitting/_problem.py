@@ -1,5 +1,5 @@
 """The errors that a fit minimizes (Eq. 3) and reports (Eq. 4), and the fit as a function of the
-logarithms of the variances: the weights are solved inside (variable projection).
+logarithms of the variances: a linear solve eliminates the weights (variable projection).
 """
 
 import equinox as eqx
@@ -59,8 +59,8 @@ def relative_error(
     r"""Compute the relative error of a fit: the root of Eq. 3 divided by the root of the integral
     of `r R^2` (Eq. 4).
 
-    It depends on the core of a profile, and little on its tail: see `FitResult.energy_error` for
-    the energy.
+    It depends mainly on the core of a profile, and little on its tail; for the energy, see
+    `FitResult.energy_error`.
 
     **Arguments:** as for `squared_error`. Differentiable where the fit is not perfect.
 
@@ -120,7 +120,7 @@ class FitProblem(eqx.Module):
         return jnp.exp(log_variances) * self.squared_unit
 
     def log_variances(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
-        """Compute the logarithms of given variances, mm^2; they are constants of derivatives."""
+        """Compute the logarithms of given variances, mm^2; derivatives treat them as constants."""
         variances = jax.lax.stop_gradient(variances).astype(self.target.dtype)
         return jnp.log(variances / self.squared_unit)
 
@@ -134,8 +134,8 @@ class FitProblem(eqx.Module):
         Float[Array, "channels gaussians gaussians"],
         Float[Array, "channels nodes"],
     ]:
-        """Find the best coefficients of each channel: the basis, the coefficients, their response
-        and the residuals. Gaussians that are not active have the coefficient 0.
+        """Find the best coefficients of each channel; return the basis, the coefficients, their
+        response and the residuals. Inactive Gaussians have coefficient 0.
         """
         variances = self.variances(log_variances)
         energies = self.energies(variances)
@@ -157,8 +157,8 @@ class FitProblem(eqx.Module):
         log_variances: Float[Array, " gaussians"],
         active: Bool[Array, " gaussians"] | None = None,
     ) -> Float[Array, "channels nodes"]:
-        """Compute the residuals of the best weights; the sum of squares of a channel is the square
-        of its Eq. 4.
+        """Compute the residuals of the best weights; the sum of their squares in a channel is the
+        square of its error (Eq. 4).
         """
         return self.solve(log_variances, active)[-1]
 
@@ -170,7 +170,7 @@ class FitProblem(eqx.Module):
         """Compute the sum of squared residuals and its derivatives in closed form."""
         basis, coefficients, response, residuals = self.solve(log_variances, active)
         slopes, curved, moved = self._slopes(log_variances, basis, coefficients, response)
-        # The derivative of the best coefficients; the first term is that of a basis without
+        # The derivative of the best coefficients; the first term alone is the derivative for zero
         # residuals.
         along = jnp.einsum("cnk,cn->ck", slopes, residuals)
         follow = moved + response * along[:, None, :]
@@ -190,8 +190,8 @@ class FitProblem(eqx.Module):
     def outcome(
         self, log_variances: Float[Array, " gaussians"]
     ) -> tuple[SumOfGaussians, Float[Array, " channels"], Float[Array, "parameters parameters"]]:
-        """Compute the Gaussians of an optimum, Eq. 4 of its channels, and the covariance that
-        `FitResult` describes.
+        """Compute the Gaussians of an optimum, the error (Eq. 4) of each channel, and the
+        covariance that `FitResult` describes.
         """
         basis, coefficients, response, residuals = self.solve(log_variances)
         squared = jnp.sum(residuals * residuals, axis=1)
@@ -230,7 +230,9 @@ class FitProblem(eqx.Module):
         return slopes, curved, moved
 
     def energies(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
-        """The weight of a Gaussian of unit norm: the integral of r G(v, r)^2 is 1 / (8 pi^2 v)."""
+        """Compute the weight that gives a Gaussian unit norm: the integral of r G(v, r)^2 is 1 / (8
+        pi^2 v).
+        """
         return jnp.sqrt(8 * jnp.pi**2 * variances)
 
 

@@ -19,7 +19,7 @@ from splatjax.scattering import Medium
 from ._problem import Expansion, FitProblem
 from ._weights import NormalEquations, invert_moving
 
-# Log variances, in squared length scales, between which a single Gaussian starts.
+# Range of the log variances (in squared length scales) from which a single Gaussian starts.
 _FIRST = (-3.0, 4.0)
 
 # Distance in log variance at which a Gaussian starts outside the previous ones; neighbors are 1.4
@@ -30,8 +30,8 @@ _TOLERANCE = 1e-3
 # Enough to compare the starts, and for Newton's method to converge from the best one.
 _STEPS = 64
 
-# A fit has converged when a step of Gauss and Newton would lower the sum of squares by less than
-# this share of it,
+# A fit has converged if a Gauss-Newton step would lower the sum of squares by less than this
+# fraction of it,
 _GAIN = 1e-6
 
 # or by less than the square of this many units of rounding of the profile's norm, because the
@@ -72,8 +72,8 @@ class DipoleStarts(eqx.Module):
     index of refraction.
 
     In units of squared mean free paths the variances depend only on these two. They are tabulated
-    at steps of `sqrt(1 - alpha')`, of which they are smooth functions, and interpolated linearly in
-    their logarithms; outside of the table the nearest entry is used.
+    at equal steps of `sqrt(1 - alpha')`, on which they depend smoothly, and their logarithms are
+    interpolated linearly. Outside the table the nearest entry is used.
 
     **Attributes:**
 
@@ -115,8 +115,8 @@ class DipoleStarts(eqx.Module):
 
 
 def constant(problem: FitProblem) -> FitProblem:
-    """Make a problem constant for derivatives, in JAX's default precision: optimistix damps in that
-    precision, whatever the problem has.
+    """Make a problem constant for derivatives, and convert it to JAX's default precision:
+    optimistix computes damping in that precision, whatever the precision of the problem.
     """
     return jax.tree.map(
         lambda leaf: jax.lax.stop_gradient(leaf).astype(jnp.result_type(float)), problem
@@ -144,8 +144,8 @@ def greedy_path(problem: FitProblem, max_count: int) -> Float[Array, "counts gau
 def _insert(
     best: Float[Array, " gaussians"], active_count: Int[Array, ""], place: Int[Array, ""]
 ) -> Float[Array, " gaussians"]:
-    """Append a log variance between two of the first `active_count - 1`, which ascend, or beyond
-    them.
+    """Append a log variance between two of the first `active_count - 1` ascending ones, or beyond
+    either end.
     """
     last = active_count - 1
     half = (_FIRST[1] - _FIRST[0]) / (2 * best.shape[0])
@@ -195,7 +195,7 @@ def _cost(residuals: Float[Array, "channels nodes"]) -> Float[Array, ""]:
 
 
 class AbstractSpread(eqx.Module):
-    """Which channels of a fit share their variances, and hence form one problem."""
+    """The choice of channels that share their variances, and hence form one problem."""
 
     @abc.abstractmethod
     def over(
@@ -239,8 +239,8 @@ def stationary(
     r"""Differentiate an optimum by the implicit function theorem; its value is unchanged.
 
     `g(log_variances, profile) = 0` at the optimum, so `d log_variances = -H^-1 dg`, where `H`, the
-    derivative of `g`, is the full Hessian of Eq. 3 after the weights are eliminated (not that of
-    Gauss and Newton). Forward and reverse mode.
+    derivative of `g`, is the full Hessian of Eq. 3 after the weights are eliminated (not the
+    Gauss-Newton approximation). It works in forward and reverse mode.
     """
 
     def tangent_solve(linear, tangent):
@@ -267,8 +267,8 @@ def refine(
         best, newton, _, steps = state
         trial = best[0] - newton
         expansion = problem.expand(trial)
-        # Steps of the size of rounding have gains and losses of that size. They end the search and
-        # are rejected.
+        # Steps as small as rounding change the cost only by rounding. They end the search and are
+        # rejected.
         moved = (steps == 0) | (
             jnp.max(jnp.abs(newton)) > _STEP * float(jnp.finfo(trial.dtype).eps)
         )
@@ -278,7 +278,7 @@ def refine(
         return best, invert_moving(expansion.hessian) @ expansion.gradient, better, steps + 1
 
     unknown = jnp.full((), jnp.inf, start.dtype)
-    # The best point with its cost and gain, the next step, whether to go on, and how many steps.
+    # The best point with its cost and gain, the next step, whether to continue, and the step count.
     state = (start, unknown, unknown), jnp.zeros_like(start), jnp.asarray(True), jnp.asarray(0)
     best, *_ = jax.lax.while_loop(lambda state: state[2] & (state[3] <= _NEWTON_STEPS), step, state)
     point, cost, gain = best

@@ -17,7 +17,7 @@ from splatjax.gaussians import AbstractProfile, SumOfGaussians
 
 from ._models import weight_factors
 
-_MOST = 3  # parameters
+_MOST = 3  # largest number of parameters
 
 
 class WeightTable(eqx.Module):
@@ -32,10 +32,10 @@ class WeightTable(eqx.Module):
 
     - `names`: names of the parameters; `logarithmic`: whether the scale of each is logarithmic.
       Static.
-    - `base`: the Gaussians whose weights are multiplied: the Gaussians of the scene's material.
+    - `base`: the Gaussians of the scene's material, whose weights are multiplied by the factors.
     - `limits`: the least and the largest value of each parameter.
     - `knots`: the nodes of each parameter, as fractions of its range on its scale.
-    - `slopes`: slope of the splines at each knot, for a value of 1 at another knot.
+    - `slopes`: slopes at all knots of the splines that are 1 at one knot and 0 at the others.
     - `at_nodes`: the factors, row by row of the grid; the last parameter varies fastest.
     """
 
@@ -61,7 +61,7 @@ class WeightTable(eqx.Module):
         return self.interpolate(self.fractions(values))
 
     def fractions(self, values: Mapping[str, Numbers]) -> Float[Array, "splats parameters"]:
-        """Check values, and compute where they are in the range of their parameters: 0 to 1."""
+        """Check values, and compute their positions in the ranges of their parameters, 0 to 1."""
         if set(values) != set(self.names):
             raise ValueError(
                 f"values are given for {', '.join(values)}; give {', '.join(self.names)}"
@@ -75,7 +75,7 @@ class WeightTable(eqx.Module):
         return (self._scaled(points) - low[None]) / (high - low)[None]
 
     def values(self, fractions: Float[Array, "splats parameters"]) -> dict[str, Array]:
-        """Compute the values of fractions of the ranges: the inverse of `fractions`."""
+        """Compute parameter values from fractions of their ranges: the inverse of `fractions`."""
         low, high = self._scaled(self.limits.T)
         rows = (low[None] + (high - low)[None] * fractions).T
         return {
@@ -114,7 +114,7 @@ class WeightTable(eqx.Module):
 def _spline_shares(
     knots: Float[Array, " knots"], slopes: Float[Array, "knots knots"], x: Float[Array, " points"]
 ) -> Float[Array, "points knots"]:
-    """Compute the share of each knot in a spline: Hermite's cubics."""
+    """Compute the weight of each knot in a spline, by cubic Hermite polynomials."""
     cell = jnp.clip(jnp.searchsorted(knots, x, side="right") - 1, 0, len(knots) - 2)
     width, unit = (knots[cell + 1] - knots[cell])[:, None], jnp.eye(len(knots), dtype=knots.dtype)
     t = (x - knots[cell])[:, None] / width
@@ -151,8 +151,8 @@ def weight_table(
 
     **Returns:** a `WeightTable`, in the precision of the base.
 
-    **Raises:** `ValueError` for other numbers of parameters, and for nodes that are fewer than two
-    or do not ascend.
+    **Raises:** `ValueError` for another number of parameters, and for fewer than two nodes or nodes
+    that do not ascend.
     """
     if not 1 <= len(nodes) <= _MOST:
         raise ValueError(f"nodes has {len(nodes)} parameters; give one to {_MOST}")

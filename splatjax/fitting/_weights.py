@@ -32,7 +32,7 @@ def invert(matrix: Float[Array, "columns columns"]) -> Float[Array, "columns col
 
     def eliminate(column, matrix):
         is_column = jnp.arange(matrix.shape[0]) == column
-        # The unit vector replaces the column, and becomes that of the inverse.
+        # The unit vector replaces the column, and becomes the column of the inverse.
         replaced = jnp.where(is_column[None], is_column[:, None].astype(matrix.dtype), matrix)
         row = replaced[column] / matrix[column, column]
         reduced = replaced - matrix[:, column][:, None] * row[None]
@@ -75,7 +75,7 @@ class NormalEquations(lx.AbstractLinearSolver):
     def compute(self, state, vector, options):
         matrix, inverse, transposed, structures = state
         right = ravel_vector(vector, structures)
-        # The transposed system is wide: its shortest solution.
+        # The transposed system is wide: use its shortest solution.
         solution = (
             matrix @ (inverse @ right) if transposed else least_squares(matrix, right, inverse)
         )
@@ -142,8 +142,8 @@ class AbstractWeights(eqx.Module):
 
 
 class FreeWeights(AbstractWeights):
-    """Any weights, for the least error of Eq. 3. Their sum may differ from the profile's total
-    reflectance by a few per cent.
+    """Unconstrained weights, for the least error (Eq. 3). Their sum may differ from the profile's
+    total reflectance by a few per cent.
     """
 
     def solve(self, basis, target, energies, total):

@@ -16,7 +16,7 @@ from ._mesh import Mesh, unit, vertex_normals
 from ._sample import splats_at
 from ._scatter import scatter
 
-_STEP, _TILT = 0.01, 0.002  # units of the file: of positions (mm), and of normals
+_STEP, _TILT = 0.01, 0.002  # units in the file, of positions (mm) and of normals
 _MIDDLE = np.asarray([0.0, -30.0, -10.0])
 
 

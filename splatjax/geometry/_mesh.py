@@ -129,8 +129,8 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
     - `mesh`: normals of length zero are estimated.
     - `degrees`: the angle, from 0 to 180.
 
-    **Returns:** the mesh without triangles that have no area, with as many vertices at a place as
-    there are normals.
+    **Returns:** the mesh without triangles of zero area, with one vertex at a place for each normal
+    there.
 
     **Source:** Thürmer and Wüthrich 1998, "Computing Vertex Normals from Polygonal Facets", for the
     mean by angles.
@@ -154,7 +154,8 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
     angles = np.arccos(np.clip(-np.einsum("fki,fki->fk", sides, np.roll(sides, 1, axis=1)), -1, 1))
     shares = (angles[..., None] * facing[:, None]).reshape(-1, 3)
     estimated = unit(np.stack([np.bincount(groups, share) for share in shares.T], axis=1))
-    # A new vertex for each pair of an old one and a group, or of an old one alone where it stays.
+    # Make a new vertex for each pair of an old vertex and a group, or for each old vertex that is
+    # unchanged.
     vertex = mesh.faces.ravel()
     group = np.where(replaced[vertex], groups, -1)
     key = vertex * np.int64(len(estimated) + 1) + group
@@ -183,7 +184,7 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
     is_tip = is_above[split] == tip_above[:, None]
     turn = (is_tip.argmax(axis=1)[:, None] + np.arange(3)) % 3
     tip, left, right = np.moveaxis(np.eye(3)[turn], 1, 0)
-    # Symmetric in the ends of an edge, so that neighbors cut the edge between them alike.
+    # The formula is symmetric in the ends of an edge, so that neighbors cut it at the same point.
     off_tip, *off_ends = np.abs(np.take_along_axis(y[split], turn, axis=1)).T[..., None]
     first, second = (
         (off_end * tip + off_tip * end) / (off_end + off_tip)

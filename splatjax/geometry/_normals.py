@@ -12,9 +12,10 @@ from ._mesh import distinct, morton_order
 from ._scatter import tangent_frames
 
 _CHUNK = 1 << 16
-_BEYOND = 1.05  # of the distance of the farthest neighbor, so that it counts a little
-_WINDOW = 8  # nearest points that make a plane
-_FLAT = 1e-3  # of a window's squared size: planes that are off by less are as good as each other
+# Reach of the weights, in distances of the farthest neighbor, so that it still counts.
+_BEYOND = 1.05
+_WINDOW = 8  # nearest points to which a plane is fitted
+_FLAT = 1e-3  # of a window's squared size; planes that deviate by less count as equally good
 
 
 def estimate_normals(
@@ -25,8 +26,8 @@ def estimate_normals(
     A plane is fitted to the nearest points of each point (principal components, weighted by
     distance). The normal of a point is the mean of the normals of its own plane and of its
     neighbors' planes, each weighted by how well the plane fits its own points and this point. At an
-    edge the planes of one side dominate, near a second sheet the planes of the point's own sheet,
-    and noise is averaged over many planes. Points that are visible from outside face the viewer;
+    edge, the planes of one side dominate; near a second sheet, the planes of the point's own sheet
+    do. Noise is averaged over many planes. Points that are visible from outside face the viewer;
     hidden ones follow their neighbors, and a surface open to both sides faces away from its middle
     at the farthest point.
 
@@ -89,13 +90,13 @@ def _planes(
 
 
 _VIEWS = 32
-_SURE = 0.7  # share of the votes by which one side wins
-_DOUBT = 0.5  # votes that nobody cast: a side seen once is not sure yet
-_SMOOTH = 0.99  # agreement of neighbors in one patch
+_SURE = 0.7  # fraction of the votes that decides for a side
+_DOUBT = 0.5  # votes added to the total, so that a side seen once is not yet certain
+_SMOOTH = 0.99  # least agreement of neighbors in one patch
 _LEAST_PATCH = 100
-_BLOCK, _PROBES = 32, 256  # points that are seen from afar as one; of a patch that are looked at
+_BLOCK, _PROBES = 32, 256  # number of points summed as one; most points tested in a patch
 _CLEAR = 0.05
-_ROOT = 1e-9  # cost of being one; a zero would be no edge
+_ROOT = 1e-9  # cost of the edge to a root; 0 would mean no edge
 
 Signs = Float[np.ndarray, " n"]
 
@@ -138,7 +139,7 @@ def outward_signs(
         return signs
     areas = np.pi / near.shape[1] * reaches**2
     _turn_cavities(points, (areas * signs)[:, None] * normals, patches, signs)
-    sure[np.concatenate(patches)] = True  # and what lies between them follows
+    sure[np.concatenate(patches)] = True  # points between patches follow them
     return _carried(points, normals, near, np.flatnonzero(sure), signs)[0]
 
 
@@ -287,7 +288,7 @@ def _winding(
         np.add.reduceat(oriented, starts),
     )
     angles = np.empty(len(probes))
-    for i, probe in enumerate(probes):  # one by one, in memory that does not grow with both
+    for i, probe in enumerate(probes):  # one by one, so that memory does not grow with both numbers
         ray = middles - probe[None]
         cubed = np.einsum("bi,bi->b", ray, ray) ** 1.5
         angles[i] = (np.einsum("bi,bi->b", ray, normals) / np.where(cubed > 0, cubed, np.inf)).sum()

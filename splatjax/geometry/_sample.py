@@ -19,8 +19,8 @@ class Textures(eqx.Module):
 
     **Attributes:**
 
-    - `albedo`: diffuse color, linear, in [0, 1]; or one for each part of the mesh, of one pixel
-      where a part is plain.
+    - `albedo`: diffuse color, linear, in [0, 1]; or one map for each part of the mesh, of one pixel
+      for a part without texture.
     - `specular`: factor on the material's specular strength.
     - `roughness`: factor on the material's roughness.
     - `normal`: tangent-space normals in [-1, 1]: x along u, y along v (*up*), z outward; of any
@@ -66,8 +66,8 @@ def lookup_at(
 def albedo_at(
     textures: Textures, mesh: Mesh, points: SurfacePoints
 ) -> Float[np.ndarray, "n channels"] | None:
-    """Return the albedo of points on a mesh: of its textures, times the colors of its vertices;
-    `None` if it has neither.
+    """Compute the albedo at points on a mesh: its texture times the colors of its vertices; `None`
+    if it has neither.
     """
     if isinstance(textures.albedo, tuple):
         assert mesh.parts is not None
@@ -93,8 +93,8 @@ def perturbed_normals(
     normals: Float[np.ndarray, "n 3"],
     tangent_space: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Turn tangent-space normals into world space, in the frame of the mesh's texture coordinates,
-    and make them unit.
+    """Transform tangent-space normals to world space, by the frame of the mesh's texture
+    coordinates, and normalize them.
 
     The tangent is the direction in which u grows on the face, made orthogonal to the interpolated
     normal; the bitangent completes the frame on the side where v grows. Faces with degenerate
@@ -127,7 +127,7 @@ def sample_mesh(
     - `mesh`: mm, with positive area.
     - `count`: number of splats, at least 1.
     - `textures`: looked up bilinearly at every splat.
-    - `seed`: another spread of the same quality; the same seed gives the same splats.
+    - `seed`: seed of the random positions; the same seed gives the same splats.
     - `rounded`: place splats on a curved surface that follows the mesh's normals, instead of on
       flat triangles.
 
@@ -191,7 +191,8 @@ def _radii(
 
 
 _NEIGHBORS = 8
-_ALONE = 5.0  # times farther from its neighbors than they are from theirs
+# An isolated point is this many times farther from its neighbors than these from theirs.
+_ALONE = 5.0
 
 
 def complete_splats(

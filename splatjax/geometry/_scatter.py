@@ -58,11 +58,11 @@ def surface_cells(
       none.
     - `neighbors`: number of nearest points to consider.
     - `limit`: mm; `None`: 0.75 of the mean distance to the six nearest points.
-    - `directions`: of the quadrature. With 32 the area is good to about 1 %.
+    - `directions`: number of directions of the quadrature; with 32, areas are accurate to about 1%.
 
     **Returns:** per point: the area of its cell (mm^2), its farthest corner (mm), and the vector to
-    its centroid (mm). On a closed surface sampled evenly the areas add up to its own within about 1
-    %.
+    its centroid (mm). On an evenly sampled closed surface, the areas add up to the area of the
+    surface within about 1%.
     """
     count = len(points)
     if count == 1:
@@ -89,7 +89,7 @@ def surface_cells(
         squared = np.where(same_side & ~coincident, squared, np.inf)
         axes = np.stack(tangent_frames(facing))
         across = np.einsum("nki,ani->nka", offsets.astype(np.float32), axes)
-        # Of the distance to the border of the cell; negative behind the point.
+        # The inverse distance to the border of the cell; negative behind the point.
         inverse = (across @ fan) * (2 / squared)[..., None]
         nearest = distances[part, 1:7]
         around = nearest.sum(axis=1) / np.maximum((nearest > 0).sum(axis=1), 1)
@@ -185,7 +185,7 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
             points = _settle(mesh, beyond, points.faces, positions + 1.3 * to_centroids)
     return points.take(
         morton_order(points.positions(mesh).astype(np.float32))
-    )  # as it will be seen in single precision
+    )  # the order in single precision
 
 
 def mirror_images(

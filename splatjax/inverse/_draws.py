@@ -36,7 +36,7 @@ def randomized_fits(
 
     **Arguments:**
 
-    - `fit`: calls `fit_scene` with observations and `start=`.
+    - `fit`: function of observations and `start=` that calls `fit_scene`.
     - `observations`: the observations of the fit.
     - `fitted`: the converged fit.
     - `count`: number of draws. The relative error of a bar is `1 / sqrt(2 (count - 1))`.

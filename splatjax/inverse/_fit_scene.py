@@ -106,13 +106,13 @@ class FittedScene(eqx.Module):
     **Attributes:**
 
     - `splats`: the body.
-    - `cameras`, `lights`: those of each picture; `material`: the given one.
+    - `cameras`, `lights`: cameras and lights of each picture; `material`: the given material.
     - `maps`: the values of each parameter of a `ParameterMap`, by name.
-    - `losses`: at the start and after each step: the sum of the losses of all pixels and of the
-      priors, divided by the number of values that count. About 1 if the residual is noise.
+    - `losses`: loss at the start and after each step: the sum over all pixels and priors, divided
+      by the number of values that count. About 1 if the residual is noise.
     - `best`: the step with the least loss, to which the other fields belong. Static.
     - `plans`: number of plans, including the first. Static.
-    - `pictures`: rendered; NaN where a pixel does not count.
+    - `pictures`: the rendered pictures; NaN where a pixel does not count.
     - `residuals`: rendered minus observed pictures.
     - `result`: the outcome, as a message (`optimistix.RESULTS`).
     - `coordinates`, `state`: coordinates and state from which another fit can `start`.
@@ -133,8 +133,8 @@ class FittedScene(eqx.Module):
     plans: int = eqx.field(static=True)
 
     def restarted(self, expected: list[Array] | None = None) -> "FittedScene":
-        """Return the start of a new fit at the best step, by any optimizer; `expected` replaces the
-        means of the residuals of the priors.
+        """Return the start of a new fit from the best step, with any optimizer; `expected` replaces
+        the means of the residuals of the priors.
         """
         expected = self.state.expected if expected is None else expected
         state = FitState(self.coordinates, None, self.state.plans, expected)
@@ -178,8 +178,8 @@ def fit_scene(
       their cameras and lights, which are otherwise assumed right. Without a deviation, the noise is
       1% of the root mean square of the picture.
     - `splats`: the body, mm; `AlbedoMap` and `NormalOffsets` start from it.
-    - `material`: the known material; for a `ParameterMap`, with the Gaussians of its table.
-      `recover` finds coefficients.
+    - `material`: the known material; with a `ParameterMap`, it must have the Gaussians of the
+      table. To find coefficients, use `recover`.
     - `parts`: the parts that may change, each kind once.
     - `optimizer`: any optimizer of optax whose update needs only gradients. Its learning rate is in
       steps: `optax.adam(1.0)` first moves each coordinate by one step at a time. With a rate that
@@ -190,16 +190,16 @@ def fit_scene(
       `BlackBackground()` all unmasked pixels count, which determines cameras and outlines much
       better.
     - `settings`: settings of the renderer.
-    - `start`: a fit to continue, by `steps` more. If all other arguments are equal, the result
-      equals that of one fit with all steps, bit for bit.
+    - `start`: a fit to continue for another `steps` steps. If all other arguments are equal, the
+      result equals, bit for bit, the result of one fit with all steps.
     - `progress`: called with a description of each stage, and the loss.
     - `throw`: raise when a loss or gradient is not finite; otherwise `result` reports it, and the
       best scene so far is returned.
 
     **Returns:** a `FittedScene`: the best of all steps, in the precision of the splats.
 
-    **Raises:** `ValueError` for no observation, part or step, for parts given twice or without
-    anything to change, for channels that disagree, for lights of unknown intensity (use
+    **Raises:** `ValueError` for no observation, part or step, for a part given twice or with
+    nothing to change, for channels that disagree, for lights of unknown intensity (use
     `LightStrengths`), and for a picture without a pixel that counts; an error with the message of
     `result` if `throw`.
     """

@@ -1,6 +1,4 @@
-"""The parts of a scene that may move, together: their coordinates, what moves by them, and the
-state of a fit.
-"""
+"""All movable parts of a scene: their coordinates, the moved scene, and the state of a fit."""
 
 from collections.abc import Sequence
 
@@ -14,7 +12,7 @@ from splatjax.scene import Material, Splats
 from ._observation import PicturedScene
 from ._parts import AbstractPart
 
-# Coordinates of each part; a tuple with those of each picture if pictures do not share the part.
+# Coordinates of each part; a tuple with one entry per picture if pictures do not share the part.
 Coordinates = tuple[PyTree[Array], ...]
 
 
@@ -48,7 +46,7 @@ class MovableScene(eqx.Module):
         )
 
     def of_all(self, pictures: Sequence[Coordinates]) -> Coordinates:
-        """Combine derivatives in the coordinates of each picture: add those of shared parts."""
+        """Combine the derivatives of all pictures: add the derivatives of shared parts."""
         return tuple(
             jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *derivatives)
             if part.shared
@@ -85,9 +83,9 @@ class FitState(eqx.Module):
     **Attributes:**
 
     - `x`: the coordinates of the next step.
-    - `optimizer`: its state; `None` to start again.
-    - `plans`: of the pictures.
-    - `expected`: means of the residuals of the priors; zeros but in `randomized_fits`.
+    - `optimizer`: state of the optimizer; `None` for its initial state.
+    - `plans`: plans of the pictures.
+    - `expected`: means of the residuals of the priors; zero except in `randomized_fits`.
     """
 
     x: Coordinates

@@ -1,6 +1,4 @@
-"""Observed pictures and those that could be taken, the pixels that count, and the loss of their
-residuals.
-"""
+"""Observed pictures, candidate pictures, the pixels that count, and the loss of their residuals."""
 
 import abc
 from collections.abc import Sequence
@@ -22,9 +20,9 @@ from splatjax.scene import (
     Splats,
 )
 
-# Coverage from which a pixel shows nothing behind the body.
+# Coverage above which a pixel shows nothing behind the body.
 _FILLED = 0.999
-# Deviation of pictures without a given one, as a fraction of their brightness. Error bars do not
+# Assumed deviation of pictures without one, as a fraction of their brightness. Error bars do not
 # depend on it.
 _UNKNOWN_NOISE = 0.01
 
@@ -34,8 +32,8 @@ class AbstractIntensity(eqx.Module):
 
     @abc.abstractmethod
     def groups(self, channels: int) -> np.ndarray:
-        """Return for each channel the index of its factor among the factors of the picture; -1 if
-        it is known to be 1.
+        """Return the index of each channel's factor among the factors of the picture; -1 for a
+        factor known to be 1.
         """
 
 
@@ -166,13 +164,13 @@ class AbstractLoss(eqx.Module):
 
     @abc.abstractmethod
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Compute the root of the loss, with the sign of the residual: near zero the
-        residual itself.
+        """Compute the square root of the loss, with the sign of the residual; near zero it equals
+        the residual.
         """
 
 
 class SquaredLoss(AbstractLoss):
-    """The square: right for normal noise, sensitive to highlights outside of the model."""
+    """Squared loss: right for normal noise, but sensitive to highlights outside of the model."""
 
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
         return residuals
@@ -187,7 +185,7 @@ class HuberLoss(AbstractLoss):
 
     **Attributes:**
 
-    - `bend`: residual, in deviations, at which one becomes the other; positive. Static.
+    - `bend`: residual at the transition, in deviations; positive. Static.
 
     **Raises:** `ValueError` for a bend that is not positive.
 
@@ -204,11 +202,11 @@ class HuberLoss(AbstractLoss):
 
 
 class AbstractBackground(eqx.Module):
-    """The pixels that count, by their coverage."""
+    """The choice of the pixels that count, by their coverage."""
 
     @abc.abstractmethod
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
-        """Return 1 for pixels that count, 0 for others; constant to the derivative."""
+        """Return 1 for pixels that count, 0 for others; derivatives treat it as constant."""
 
 
 class UnknownBackground(AbstractBackground):
@@ -235,7 +233,7 @@ class Evidence(eqx.Module):
     **Attributes:**
 
     - `picture`: 0 where it is unknown.
-    - `deviation`: of its noise.
+    - `deviation`: standard deviation of its noise.
     - `known`: pixels that may count.
     - `relative_noise`: the deviation of a typical pixel over the brightness of the picture.
     """

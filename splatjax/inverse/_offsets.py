@@ -14,9 +14,9 @@ from splatjax.scene import Splats
 from ._observation import PicturedScene
 from ._parts import AbstractPart
 
-_REACH = 2.5  # of the blur, standard deviations
-_SLOPES = 17  # splats among which slopes are measured, itself included
-_ROUNDED = 16  # neighbors at a time, so that similar bodies share a program
+_REACH = 2.5  # reach of the blur, standard deviations
+_SLOPES = 17  # splats used to measure a slope, including the splat itself
+_ROUNDED = 16  # neighbor counts are rounded up to multiples, so that similar bodies share a program
 _SAME_SIDE = 0.3  # least cosine between normals of splats that belong together
 
 
@@ -25,7 +25,7 @@ class SurfaceMean(eqx.Module):
 
     **Attributes:**
 
-    - `near`: the neighbors; those beyond reach and on another side have weight 0.
+    - `near`: the neighbors; those out of reach or on another side have weight 0.
     - `gain`: root mean square of the means of independent noise of deviation 1.
     """
 
@@ -62,9 +62,10 @@ class OffsetTables(eqx.Module):
     """The mean of offsets, the neighbors of each splat, and weights of sums over them."""
 
     mean: SurfaceMean
-    around: Int[Array, "splats _around"]  # from which the slope of an offset is computed
-    slopes: Float[Array, "splats _around 2"]  # of derivatives, exact for quadratic functions
-    tangents: Float[Array, "splats 2 3"]  # along which they are
+    around: Int[Array, "splats _around"]  # neighbors from which slopes are computed
+    # Weights of derivatives, exact for quadratic functions.
+    slopes: Float[Array, "splats _around 2"]
+    tangents: Float[Array, "splats 2 3"]  # directions of the derivatives
 
 
 class NormalOffsets(AbstractPart):
@@ -83,7 +84,7 @@ class NormalOffsets(AbstractPart):
 
     **Attributes:** (static)
 
-    - `step`: offset by a coordinate of 1, mm.
+    - `step`: offset for a coordinate of 1, mm.
     - `smoothness`: standard deviation of the blur, mm; choose a few spacings of the splats. Finer
       bumps are not found.
     - `deviation`: expected size of an offset, one standard deviation of a normal prior, mm.
@@ -120,7 +121,7 @@ class NormalOffsets(AbstractPart):
         splats = pictured.splats
         shifts = self.step * prepared.mean(x[:, None]) * splats.normals
         apart = shifts[prepared.around] - shifts[:, None]
-        # The tangents of the start, and the slopes of the offsets along them.
+        # The initial tangents, tilted by the slopes of the offsets along them.
         along = prepared.tangents + jnp.sum(prepared.slopes[..., None] * apart[:, :, None], axis=1)
         across = jnp.cross(along[:, 0], along[:, 1])
         stretch = jnp.sqrt(jnp.sum(across * across, axis=1))

@@ -38,12 +38,13 @@ class ParameterMap(AbstractPart):
 
         fraction = 1 / (1 + exp(-(logit(start) + blur(B x))))
 
-    The fraction is the place of a value in the range of its parameter, on the parameter's scale.
+    The fraction is the position of a value in the range of its parameter, on the parameter's scale.
     The blur is a Gaussian mean over the surface. `B` is the inverse root of `J^T J / step^2 + 1 /
-    deviation^2`, where `J` has the derivatives of the reflectance of a flat surface at the start
-    with respect to the logits, relative to its mean over the channels. One coordinate therefore
-    changes the color by about one step, in directions that are independent where parameters have
-    similar effects. A splat farther than 2.5 `smoothness` from all visible ones keeps its start.
+    deviation^2`, where `J` contains the derivatives, at the start and with respect to the logits,
+    of the reflectance of a flat surface, divided by its mean over the channels. One coordinate
+    therefore changes the color by about one step, in directions that are independent where
+    parameters have similar effects. A splat farther than 2.5 `smoothness` from all visible ones
+    keeps its start.
 
     The part replaces `Splats.weights`. An albedo of the same splats must be known.
 
@@ -55,7 +56,7 @@ class ParameterMap(AbstractPart):
       of the splats, maps become smoother, and fits slower.
     - `deviation`: expected distance of a logit from its start, one standard deviation of a normal
       prior; 2 covers nearly the whole range. Static.
-    - `step`: change of the color by a coordinate, relative. Static.
+    - `step`: relative change of the color for a coordinate of 1. Static.
 
     **Raises:** `ValueError` for parameters of other names, and for a start outside of the table.
     """

@@ -14,9 +14,9 @@ from splatjax.scene import AbstractLight, Material, Splats
 
 from ._observation import PicturedScene
 
-# A bounded quantity starts between this and one less this: at 0 and 1 its logit is infinite.
+# Bounded quantities start at least this far from 0 and 1, where their logits are infinite.
 BOUNDED = 1e-3
-_PLACES = ("direction", "position", "origin")  # of lights
+_PLACES = ("direction", "position", "origin")  # fields of lights
 
 
 class AbstractPart(eqx.Module):
@@ -47,7 +47,7 @@ class AbstractPart(eqx.Module):
 
     @abc.abstractmethod
     def coordinates(self, pictured: PicturedScene) -> PyTree[Array]:
-        """Return the coordinates of the start: zeros. Raise `ValueError` without such a part."""
+        """Return the initial coordinates: zeros. Raise `ValueError` if there is no such part."""
 
     @abc.abstractmethod
     def moved(
@@ -102,8 +102,8 @@ class AlbedoMap(AbstractPart):
 
 
 class LightStrengths(AbstractPart):
-    """The strength of each light of each picture, channel by channel, as a logarithm: of
-    irradiance, intensity or power.
+    """The logarithm of the strength of each light in each picture, channel by channel: irradiance,
+    intensity or power.
 
     **Attributes:** (static)
 

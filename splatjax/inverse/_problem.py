@@ -1,4 +1,4 @@
-"""Residuals as a function of coefficients, by layers that serve many materials."""
+"""Residuals as a function of coefficients, from layers that serve many materials."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ from ._observation import (
 )
 
 _STEPS = 64
-# Of a wide range: the ratio of neighboring variances. It leaves dipoles an error of 0.2%.
+# Ratio of neighboring variances in a wide range; fits of dipoles then have an error of 0.2%.
 _LARGER = 3.0
 # Squared mean free paths: the range of the Gaussians of a dipole's fit, and beyond.
 _NARROWEST, _WIDEST = 0.05, 200.0
@@ -73,7 +73,7 @@ def render_layers(
 
     **Arguments:**
 
-    - `plans`: used if they suffice.
+    - `plans`: plans to use if their capacity suffices.
     - `derivative`: whether variances may differ slightly from those of the material.
 
     **Returns:** the pictures, and their plans.
@@ -174,7 +174,7 @@ def fit_near(
     weights: AbstractWeights,
     rule: AbstractRadialRule,
 ) -> SumOfGaussians:
-    """Fit Gaussians whose variances are near given ones, and follow the profile."""
+    """Fit Gaussians to a profile, starting from given variances near the best ones."""
     return fit_gaussians(
         profile, len(near), weights=weights, start=GivenVariances(near), rule=rule, throw=False
     ).gaussians

@@ -1,5 +1,5 @@
-"""Coefficients of a material from pictures of a known shape; and pictures to take next, ranked by
-the error bars with them.
+"""Coefficients of a material from pictures of a known shape; and a ranking of the pictures to take
+next by the resulting error bars.
 """
 
 import warnings
@@ -79,13 +79,12 @@ def recover(
     Give a start within a factor of three of both coefficients, or several starts. The error bars
     assume that shape, lights, camera and model are right; compare `recovery.chi_squared` with 1.
 
-    The search is weighted least squares over all pixels at once, and differentiates from the
-    picture back to the coefficients. The layers,
-    which are expensive, depend only on the variances of the Gaussians, and are rendered once for
-    many Levenberg-Marquardt steps. First the variances are fixed (`wide_variances`). Each further
-    round fits `count` Gaussians to the coefficients found so far, renders their layers and the
-    derivatives of the layers with respect to the variances, and searches again, until a round
-    changes nothing.
+    The search is a weighted least-squares fit to all pixels at once, with derivatives from the
+    picture back to the coefficients. The expensive layers depend only on the variances of the
+    Gaussians, and are rendered once for many Levenberg-Marquardt steps. First the variances are
+    fixed (`wide_variances`). Each further round fits `count` Gaussians to the coefficients found so
+    far, renders their layers and the derivatives of the layers with respect to the variances, and
+    searches again, until a round changes nothing.
 
     **Arguments:**
 
@@ -241,7 +240,7 @@ def _unweighed(variances: Float[Array, " gaussians"], channels: int) -> SumOfGau
 
 
 class Prediction(eqx.Module):
-    r"""The error bars with another picture.
+    r"""The predicted error bars after one more picture.
 
     **Attributes:**
 
@@ -255,7 +254,7 @@ class Prediction(eqx.Module):
 
     @property
     def worst(self) -> Combination:
-        """The combination with the largest error, of all channels."""
+        """The combination with the largest error in any channel."""
         worst = [best_and_worst(covariance)[1] for covariance in self.covariance]
         return max(worst, key=lambda combination: combination.deviation)
 

@@ -22,7 +22,7 @@ from splatjax.fitting import (
 from splatjax.scattering import Medium
 from splatjax.scene import Material
 
-# A combination with a larger relative error counts as not fixed.
+# Relative error above which a combination counts as not fixed.
 _FIXED = 0.1
 
 
@@ -114,7 +114,7 @@ def best_and_worst(covariance: Float[np.ndarray, "2 2"]) -> tuple[Combination, C
     values, axes = np.linalg.eigh(covariance)
     largest = np.take_along_axis(axes, np.argmax(np.abs(axes), axis=0)[None], axis=0)
     axes = axes / largest
-    # The larger power is 1, and that of sigma_a is positive unless it is tiny.
+    # The larger power is 1, and the power of sigma_a is positive unless it is tiny.
     axes = np.where((axes[0] > 0.05) | (axes[1] > 0.95), axes, -axes)
     deviations = np.sqrt(np.maximum(values, 0.0))
     best, worst = (
@@ -147,8 +147,9 @@ def _power(name: str, power: float) -> str:
 _RESOLUTION = 0.5 * np.log(2.0)
 # Chi-squared per degree of freedom above which the model is incomplete.
 _TOO_LARGE = 1.5
-# Fraction of the light: marble on a head of 100,000 splats has 0.6 and is recovered within 1.4%,
-# the blue of skin has 1.0 and is not.
+# Fraction of unresolved light above which the width of the profile is hardly determined: marble on
+# a head of 100,000 splats has 0.6 and is recovered within 1.4%; the blue channel of skin has 1.0
+# and is not.
 _MOST = 0.8
 
 
@@ -160,7 +161,7 @@ class Recovery(AbstractEstimate):
     - `medium`: its coefficients, 1/mm.
     - `material`: its Gaussians, with the known surface.
     - `intensities`: factors on the light of each picture; 1 where the light was known.
-    - `information`: inverse of the covariance that the given noise leaves. The unknowns are the
+    - `information`: inverse of the covariance due to the given noise. The unknowns are the
       logarithms of `sigma_a`, channel by channel, of `sigma_s_prime`, of the unknown factors on the
       light, and, channel by channel, of the width below which the splats do not resolve a layer.
     - `unresolved`: the fraction of the light of each channel that spreads less than the spacing of
@@ -177,7 +178,8 @@ class Recovery(AbstractEstimate):
     - `ends`, `costs`: the end of the search from each start in the first round, and the sum of its
       losses.
     - `steps`, `rounds`: number of steps of all searches, and of rounds. Static.
-    - `model`, `weights`: the model, and the constraint of the weights, that explain the pictures.
+    - `model`, `weights`: the model of the profile, and the constraint on its weights, used in the
+      search.
     - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
 
     Error bars assume that model and shape are right and that the noise of pixels is independent:

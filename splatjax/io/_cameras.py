@@ -21,11 +21,11 @@ _Lens: TypeAlias = Mapping[str, Any]
 _Found: TypeAlias = Iterator[tuple[str, _Lens, _Pose]]
 _Image: TypeAlias = tuple[str, int, list[float]]  # name, camera, quaternion and translation
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
-_SQUARE = 1e-2  # pixels, at the edge of a picture, by which focal lengths may differ
-_ROWS = 512  # of a picture, whose size glTF does not specify
+_SQUARE = 1e-2  # largest error at the edge of a picture due to unequal focal lengths, pixels
+_ROWS = 512  # rows of a picture, because glTF does not specify its size
 _LIGHTS = "KHR_lights_punctual"
 _SHEAR = 1e-3  # relative difference of the scales of axes
-# Models of COLMAP with their parameters, in the order of its numbers; others have distortion.
+# COLMAP's models with their parameters, ordered by its model numbers; all others have distortion.
 _MODELS = {
     "SIMPLE_PINHOLE": ("fl_x", "cx", "cy"),
     "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
@@ -85,13 +85,14 @@ def load_camera(path: StrPath, name: str = "0", *, mm_per_unit: float, up: str =
 
 
 def resized(camera: Camera, height: int) -> Camera:
-    """Return a camera with another number of rows, and as many columns as they require."""
+    """Return a camera with another number of rows, and columns in proportion."""
     width = round(camera.width * height / camera.height)
     return replace(camera, width=width, height=height)
 
 
 def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -> Camera:
-    """Make a camera of a lens and a pose: camera to world, from right, down and forward.
+    """Make a camera from a lens and a pose: the transformation to the world from the axes right,
+    down and forward.
 
     The lens has the entries of instant-ngp: w, h, fl_x, fl_y, cx and cy, in pixels; the last three
     are optional.
@@ -161,7 +162,7 @@ def _colmap_text(path: Path) -> tuple[dict[int, _Lens], list[_Image]]:
         number, model, width, height, *values = line.split()
         parameters = zip(_MODELS.get(model, ()), map(float, values), strict=False)
         lenses[int(number)] = {"camera_model": model, "w": width, "h": height, **dict(parameters)}
-    for line in _lines(path / "images.txt")[::2]:  # between them, the points of each
+    for line in _lines(path / "images.txt")[::2]:  # the lines between list the points of each image
         _, *pose, camera, name = line.split(maxsplit=9)
         images.append((name, int(camera), [*map(float, pose)]))
     return lenses, images

@@ -9,7 +9,7 @@ from splatjax.geometry import Mesh, tangent_frames, unit
 from splatjax.scene import AbstractLight, Camera, EnvironmentLight, RectangleLight, Splats
 
 METERS = 1e-3  # per mm
-_CORNERS = 6  # of a disc
+_CORNERS = 6  # corners of the polygon that replaces a disc
 
 
 def body_mesh(splats: Splats, mesh: Mesh | None) -> Mesh:
@@ -39,14 +39,14 @@ def body_mesh(splats: Splats, mesh: Mesh | None) -> Mesh:
 
 
 def camera_pose(camera: Camera) -> Float[np.ndarray, "4 4"]:
-    """Return the transformation to the world from right, up and back, the axes of a camera."""
+    """Return the transformation to the world from the axes of a camera: right, up and back."""
     axes = np.asarray(camera.rotation, float) * np.asarray([1, -1, -1])[:, None]
     return _pose(axes, camera.position)
 
 
 def light_pose(light: AbstractLight) -> Float[np.ndarray, "4 4"]:
-    """Return the transformation to the world from the axes of a light that shines along -z, or from
-    those of an image.
+    """Return the transformation to the world from the axes of a light, which shines along -z, or
+    from the axes of an environment's image.
     """
     if isinstance(light, RectangleLight):
         along, across = unit(np.asarray(light.edges, float))

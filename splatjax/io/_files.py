@@ -34,7 +34,7 @@ def existing_file(path: StrPath) -> Path:
 
 
 def check_suffix(path: StrPath, suffix: str) -> None:
-    """Raise `ValueError` for a file to write whose name is that of another kind."""
+    """Raise `ValueError` if the name of an output file has another suffix."""
     if Path(path).suffix.lower() != suffix:
         raise ValueError(f"{path}: the name of this file must end in {suffix}")
 

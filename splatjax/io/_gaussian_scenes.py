@@ -15,7 +15,7 @@ _PLACES, _COLORS = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _TURNS = ("rot_1", "rot_2", "rot_3", "rot_0")  # the real part last
 GAUSSIAN_COLUMNS = {*_PLACES, *_COLORS, *_SCALES, *_TURNS, "opacity"}
-_HARMONIC = 0.5 / np.pi**0.5  # of degree 0
+_HARMONIC = 0.5 / np.pi**0.5  # spherical harmonic of degree 0
 _RADIUS = 2.0  # standard deviations: a disc of this radius has the variance of the Gaussian
 
 
@@ -38,8 +38,9 @@ def surface_columns(
 ) -> dict[str, np.ndarray]:
     """Convert the columns of ellipsoids to those of splats, in the unit of the file.
 
-    Ellipsoids below an opacity are left out. The normal is the flattest axis, the radius that of a
-    disc of the variance along the two other axes, and the albedo the mean color, decoded from sRGB.
+    Ellipsoids below an opacity are left out. The normal is the shortest axis, the radius is the
+    radius of a disc with the variance along the two other axes, and the albedo is the mean color,
+    decoded from sRGB.
     """
     from scipy.spatial.transform import Rotation  # takes a third of a second
 

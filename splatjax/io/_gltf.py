@@ -45,8 +45,8 @@ def save_gltf(
       for each splat.
     - `lux`: irradiance of 1 lux in the unit of the lights, as for `load_lights`.
 
-    A warning names what glTF does not have: other lights, and another principal point than the
-    middle of the picture.
+    A warning names what glTF cannot store: lights of other kinds, and a principal point away from
+    the middle of the picture.
 
     **Raises:** `ValueError` for another suffix than .glb, or a material of neither one nor three
     channels; `OSError` if the file cannot be written.

@@ -20,14 +20,14 @@ from splatjax.scene import Camera, Frame
 from ._cameras import camera_matrices
 from ._files import StrPath, atomic_path, check_suffix, existing_file, naming
 
-_BYTES_PER_VALUE = 24.0  # in double precision, while they are decoded
+_BYTES_PER_VALUE = 24.0  # while decoding in double precision
 
 
 def read_planes(
     path: StrPath,
 ) -> tuple[dict[str, Float[np.ndarray, "height width"]], dict[str, Any], bool]:
     """Read the channels of a picture by name. Integers are divided by the maximum of their type.
-    Nothing is decoded, and alpha is not multiplied.
+    Values are not decoded, and colors are not multiplied by alpha.
 
     **Returns:** channels, attributes of the file, and whether its values are floats.
 
@@ -48,7 +48,7 @@ def read_planes(
         pixels = file.read_image("float")
     try:
         fault = oiio.geterror() if file is None else file.geterror()
-    except UnicodeDecodeError:  # it repeats bytes of the file
+    except UnicodeDecodeError:  # the message repeats bytes of the file
         fault = "its header is damaged"
     if pixels is None or fault:
         fault = " ".join(fault.replace(f'"{path}"', "").split())
@@ -62,7 +62,7 @@ def read_planes(
 
 
 def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
-    r"""Read a picture in linear light, of OpenEXR or another format of floating-point numbers.
+    r"""Read a picture in linear light, from OpenEXR or another floating-point format.
 
     **Returns:** R, G and B, or Y alone, as in the file.
 
@@ -149,7 +149,7 @@ def write_animation(
     if not frames or not 0.1 <= frames_per_second <= 60:
         given = f"{path}: {len(frames)} frames at {frames_per_second:g} per second"
         raise ValueError(f"{given}; give at least one frame, and 0.1 to 60 per second")
-    # Whole milliseconds, but every frame begins when it should.
+    # Frames begin at rounded milliseconds, so that rounding errors do not add up.
     begins = [round(1000 * i / frames_per_second) for i in range(len(frames) + 1)]
     options = {"save_all": True, "duration": np.diff(begins).tolist(), "loop": 0, "lossless": True}
     with atomic_path(path) as temporary:
@@ -157,7 +157,7 @@ def write_animation(
 
 
 class _Film(Image.Image):
-    """Files as one picture of many frames, so that one at a time is in memory."""
+    """Files as one picture of many frames, with only one frame in memory at a time."""
 
     def __init__(self, frames: Sequence[StrPath]):
         super().__init__()
@@ -220,7 +220,7 @@ def write_exr(
     does not exist.
     """
     check_suffix(path, ".exr")
-    from splatjax import __version__  # known when the whole package is imported
+    from splatjax import __version__  # defined only after the whole package is imported
 
     gaussians, channels = frame.weights.shape
     header: dict[str, Any] = {
@@ -304,8 +304,8 @@ def read_manifest(path: StrPath) -> dict[str, Any]:
 
 
 def _layout(channels: int, lights: int, gaussians: int, has_single: bool) -> dict[str, np.ndarray]:
-    """Name the planes of each field of a frame: arrays of the field's other axes than height and
-    width.
+    """Name the planes of each field of a frame: arrays over the axes of the field other than height
+    and width.
     """
 
     def colors(layer: str) -> list[str]:

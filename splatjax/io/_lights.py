@@ -34,10 +34,10 @@ from ._tables import Table, read_toml
 from ._trimesh import one_sentence
 
 PLACE = ("position", "target", "up", "fov")
-_MOST_ROWS = 512  # of an environment
+_MOST_ROWS = 512  # largest number of rows of an environment
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
 ENVIRONMENTS = {"studio": studio, "overcast": overcast_sky, "sun": sun_and_sky}
-# Entries that may be missing, of environments and of spot lights.
+# Optional entries of environments and of spot lights.
 _OF_MAPS = ("rotation", "strength", "up", "directions", "count", "cast_shadows")
 _ANGLES = ("inner_angle", "outer_angle")
 _OPTIONAL = _OF_MAPS + _ANGLES
@@ -63,9 +63,9 @@ LIGHT_ENTRIES = _FACING.union({"kind"}, *(names for _, names in _LIGHTS.values()
 
 
 def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
-    r"""Read an environment light: a latitude-longitude map of OpenEXR, Radiance HDR or another
-    format of floating-point numbers. Maps of more than 512 rows are halved, by averaging, while
-    both sides are even, with little effect on samples and highlights.
+    r"""Read an environment light: a latitude-longitude map in OpenEXR, Radiance HDR or another
+    floating-point format. Maps of more than 512 rows are halved by averaging as long as both sides
+    are even, with little effect on samples and highlights.
 
     **Arguments:** `fields`: the other fields of `EnvironmentLight`, by name.
 
@@ -189,7 +189,7 @@ def _observation(table: Table) -> Observation:
 
 
 def look_at(table: Table, width: int, height: int) -> Camera:
-    """Make the camera of a table of its place."""
+    """Make a camera from a table of position, target, up and field of view."""
     vectors = [table.numbers(name).tolist() for name in ("position", "target")]
     up = table.numbers("up", [0.0, 1.0, 0.0]).tolist()
     return table.make(
@@ -198,9 +198,9 @@ def look_at(table: Table, width: int, height: int) -> Camera:
 
 
 def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
-    """Return the table of a light; an environment has an image of this name.
+    """Return the table of a light; `image` is the file name of an environment's image.
 
-    **Raises:** `ValueError` for a light of another kind than a file can store.
+    **Raises:** `ValueError` for a light of a kind that a file cannot store.
     """
     for kind, (record, names) in _LIGHTS.items():
         if type(light) is record:
@@ -221,7 +221,7 @@ def _picture(table: Table, name: str) -> np.ndarray:
 
 
 def light_of(table: Table, channels: int) -> AbstractLight:
-    """Make the light of a table, in the channels of a picture."""
+    """Make a light from a table, with the channels of a picture."""
     kind = table.one_of("kind", _LIGHTS)
     light, names = _LIGHTS[kind]
     known, values = {"kind", *names}, dict[str, Any]()

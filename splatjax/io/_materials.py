@@ -61,7 +61,7 @@ def list_materials() -> tuple[str, ...]:
 
 
 def material_path(name_or_path: StrPath) -> Path:
-    """Return the file of an argument of `load_material`: the file of a name, or the path itself.
+    """Return the path of a material, given like in `load_material` by its name or its path.
 
     **Raises:** `ValueError` for an unknown name.
     """

@@ -48,7 +48,7 @@ def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.
 
 
 def check_colors(material: Material) -> None:
-    """Raise `ValueError` for a material that is neither gray nor in color."""
+    """Raise `ValueError` for a material that has neither one nor three channels."""
     if material.channels not in (1, 3):
         raise ValueError(f"the material has {material.channels} channels; give one of 1 or 3")
 

@@ -21,7 +21,7 @@ _WAYS = (
     {"color", "mean_free_path"},
 )
 _MM = {THICKNESS_UNIT: 1.0, "cm": 10.0, "m": 1000.0}
-# Of the subsurface of an OpenPBR material, with the defaults of OpenPBR 1.1.
+# Entries for the subsurface of an OpenPBR material, with the defaults of OpenPBR 1.1.
 _OPENPBR: dict[str, Any] = {
     "subsurface_color": 0.8,
     "subsurface_radius": 1.0,
@@ -36,7 +36,7 @@ LAYER_ENTRIES = (*MEDIUM_ENTRIES, "optical_depth", "thickness", "thickness_unit"
 
 
 def medium_of(table: Table) -> Medium:
-    """Make the medium of a table of reduced scattering, of scattering and its mean cosine, or of a
+    """Make a medium from a table of reduced scattering, of scattering and its mean cosine, or of a
     color and a mean free path.
     """
     names = (table.entries.keys() & set().union(*_WAYS)) - {"g"}

@@ -27,11 +27,11 @@ from ._images import read_color, read_map, srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
 _LUMA = np.asarray([0.299, 0.587, 0.114])  # of encoded color, Rec. 601
-_BYTES_PER_SPLAT = 2500.0  # while they are spread, measured: 1.2 GB for 683,549
-_BYTES_PER_CORNER = 300.0  # of a mesh, on its way from the file to splats
+_BYTES_PER_SPLAT = 2500.0  # while splats are sampled; measured: 1.2 GB for 683,549
+_BYTES_PER_CORNER = 300.0  # per corner of a mesh, from reading the file to sampling splats
 # Largest coordinate (areas overflow beyond), units; most repeats of a texture.
 _FARTHEST, _MOST_TILES = 1e12, 1e6
-_BORDER = 1e-3  # of a texture: coordinates may be off by this much
+_BORDER = 1e-3  # tolerance of texture coordinates beyond the border of a texture
 _ENDS = re.compile(rb'"wrap[ST]" *: *(33071|33648)')  # a texture of glTF that does not repeat
 
 
@@ -84,8 +84,9 @@ def sample_mesh(
       *lower* edge of a map; `None` follows the format: the lower edge for all except glTF and GLB.
     - `up`: the file's upward axis, `"y"` or `"z"`; splats have +y up.
     - `crop_min_y`: the mesh below this height, in the file's unit, is removed.
-    - `crease_angle`: degrees from 0 to 180. Edges between triangles that differ by more are hard,
-      if the file has no normals, or normals that differ by more than this from their triangles.
+    - `crease_angle`: degrees from 0 to 180. An edge is hard if its triangles differ by more than
+      this; used where the file has no normals, or normals that differ by more than this from their
+      triangles.
     - `seed`: seed of the random positions.
     - `rounded`: place splats on a curved surface that follows the mesh's normals, instead of on its
       flat triangles, which make the edge between light and shadow ragged. Hard edges stay straight.
@@ -209,7 +210,7 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
 
 
 def _piece(table: dict[str, Any], kind: str, columns: dict[str, Any]) -> Piece:
-    """Convert the arguments of a mesh as trimesh reads them from a file of some kind."""
+    """Convert the mesh arguments that trimesh reads from a file of the given kind."""
     from trimesh.geometry import triangulate_quads
 
     vertices, faces = np.asarray(table["vertices"], float), triangulate_quads(table["faces"])
@@ -276,7 +277,7 @@ def _placed(piece: Piece, matrix: Float[np.ndarray, "4 4"], up: str, repeats: bo
 
 
 def _joined(pieces: Sequence[Piece], mm_per_unit: float, flip_v: bool) -> Mesh:
-    """Join pieces to one mesh in mm, each a part of it; normals of length zero stay."""
+    """Join pieces into one mesh in mm, with one part per piece; zero normals are unchanged."""
     starts = np.cumsum([0, *(len(piece.mesh.vertices) for piece in pieces[:-1])])
     faces = [piece.mesh.faces + start for piece, start in zip(pieces, starts, strict=True)]
     vertices, normals, uvs, colors = (
@@ -294,7 +295,9 @@ def _joined(pieces: Sequence[Piece], mm_per_unit: float, flip_v: bool) -> Mesh:
 
 
 def _own_albedo(path: Path, pieces: Sequence[Piece]) -> np.ndarray | tuple[np.ndarray, ...] | None:
-    """Decode the textures of pieces, times their plain colors; `None` if no piece has a texture."""
+    """Decode the textures of pieces, and multiply them by their plain colors; `None` if no piece
+    has a texture.
+    """
     pictures = {None: np.ones((1, 1, 3))}
     with naming(path), TemporaryDirectory() as folder:
         for encoded in {piece.texture for piece in pieces if piece.texture}:

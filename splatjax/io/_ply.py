@@ -17,7 +17,7 @@ from ._gaussian_scenes import GAUSSIAN_COLUMNS, spz_columns, surface_columns
 from ._images import srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
-_SHORTEST, _LONGEST = 1e-9, 1e9  # mm: beyond, single precision loses areas
+_SHORTEST, _LONGEST = 1e-9, 1e9  # mm; outside this range, single precision loses areas
 _COVER = (
     "sample splats from it first: `splatjax sample {} --mm-per-unit ... --output ...`, or "
     "sample_mesh"
@@ -27,7 +27,7 @@ _COMPLETE = (
     "estimates normals, radii and areas, and `splatjax sample` of a mesh writes them"
 )
 _GAUSSIAN_SPLATTING = {"f_dc_0", "scale_0", "rot_0"}
-# Columns of the vertices of a PLY file, by the corresponding fields of splats.
+# Vertex columns of a PLY file for each field of splats.
 _COLUMNS = {
     "centers": [("x", "y", "z")],
     "normals": [("nx", "ny", "nz")],
@@ -75,7 +75,7 @@ def read_splats(
     because a mesh should be sampled (`sample_mesh`).
 
     The ellipsoids of a Gaussian-splatting scene (`f_dc_0`, `scale_0`, `rot_0`, ..., or an SPZ file,
-    which needs gsply) become discs: the flattest axis is the normal, and the two others give the
+    which needs gsply) become discs: the shortest axis is the normal, and the two others give the
     radius. A warning reports that their colors contain the light of the scene.
 
     **Arguments:**
@@ -111,8 +111,8 @@ def read_splats(
 def write_splats(path: StrPath, splats: Splats) -> None:
     r"""Write splats to a binary PLY file, in mm, as float32, completely or not at all.
 
-    Albedo of three channels is written as linear `red green blue` floats (no loss), so that
-    `read_splats` gives it back.
+    Albedo of three channels is written as linear `red green blue` floats (no loss), which
+    `read_splats` restores.
 
     **Raises:** `FileNotFoundError` when the folder does not exist, `ValueError` for an albedo that
     does not have three channels.
@@ -197,10 +197,10 @@ class SplatFile:
 
     def __call__(self) -> Iterator[Splats]:
         """Yield all splats from the beginning, in mm and in JAX's default precision, in parts of
-        one size except for a smaller last one.
+        equal size except for a smaller last one.
 
-        **Raises:** `ValueError` when numbers are not finite, or not as `read_splats` reads them;
-        the size of the whole is checked at the end.
+        **Raises:** `ValueError` for numbers that are not finite, or that `read_splats` rejects; the
+        total extent is checked at the end.
         """
         corners = []
         for begin in range(0, self.count, self.part):
@@ -216,7 +216,9 @@ class SplatFile:
         _check_places(self.path, np.stack(corners), estimated=False)
 
     def _rows(self, begin: int, count: int) -> np.memmap:
-        """Map only one part: the read pages of a larger map would count as memory."""
+        """Map only one part of the file, because all pages read from a larger map would count as
+        memory.
+        """
         offset = self._offset + begin * self._columns.itemsize
         return np.memmap(self.path, self._columns, "r", offset, count)
 

@@ -1,5 +1,5 @@
 """Scenes as TOML files: splats or a mesh, material, lights, camera and settings. The manifest of a
-picture is one, too.
+picture also describes a scene.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,9 +55,9 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
         bounces = 1
         diffusion = "clusters"       # exitance or shape
 
-    A camera is instead given by `position`, `rotation`, `focal_length` and `principal_point`, or by
-    `file`, `name` and `mm_per_unit` (`load_cameras`). The weights of a material that is named are
-    divided by their sums if the splats have albedo, as on the command line.
+    A camera can instead be given by `position`, `rotation`, `focal_length` and `principal_point`,
+    or by `file`, `name` and `mm_per_unit` (`load_cameras`). The weights of a material given by name
+    or file are divided by their sums if the splats have albedo, as on the command line.
 
     **Arguments:** `path`: path of a TOML file, or of a picture that the command line rendered.
 

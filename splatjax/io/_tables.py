@@ -47,7 +47,7 @@ class Table:
 
     def __init__(self, path: Path, name: str, entries: Any, names: Iterable[str]):
         self.path, self.name, self.entries = path, name, entries
-        self.folder = path.parent  # of the files that it names
+        self.folder = path.parent  # folder of the files that the table names
         self.where = f"{path}: [{name}]" if name else f"{path}:"
         if not isinstance(entries, dict):
             raise ValueError(f"{self.where} must be a table; it is {entries!r}")
@@ -61,7 +61,7 @@ class Table:
         return Table(self.path, f"{self.name} {name}".strip(), self.entries.get(name), names)
 
     def tables(self, name: str, names: Iterable[str]) -> "list[Table]":
-        """Return a list of tables within this one, from 1."""
+        """Return a list of tables within this one; errors number them from 1."""
         value = self.entries.get(name)
         if not isinstance(value, list) or not value:
             raise ValueError(f"{self.where} {name} must be one table or more; it is {value!r}")
@@ -196,7 +196,7 @@ def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
     Columns are `sigma_a` and `sigma_s_prime` (1/mm), `eta`, and `name` if there is one. Empty lines
     are left out.
 
-    **Returns:** the names, numbers where there are none, and the three coefficients of each.
+    **Returns:** the names (numbers if there are none), and the three coefficients of each medium.
 
     **Raises:** `FileNotFoundError`, and `ValueError`, with file, line and cause, if the file is not
     such a table.

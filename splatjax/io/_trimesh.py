@@ -68,7 +68,7 @@ def _check_gltf(text: bytes) -> None:
             raise ValueError("its vertices are quantized")
 
 
-# How many triangles a file promises, where its format has that.
+# Number of triangles that a file announces, for formats that announce it.
 _COUNTS = {"obj": _count_obj, "off": _count_off, "gltf": _check_gltf}
 
 
@@ -96,7 +96,7 @@ def one_sentence(path: Path) -> Generator[None, None, None]:
 
     **Raises:** `ValueError`; errors that already name the file pass.
     """
-    log = logging.getLogger("trimesh")  # it prints what is raised or left out
+    log = logging.getLogger("trimesh")  # it logs what is raised or ignored
     before = log.level
     log.setLevel(logging.CRITICAL)
     try:
@@ -157,7 +157,7 @@ def _columns(name: str, element: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 class _Folder:
-    """The files beside a mesh: a resolver that notes what is missing."""
+    """A resolver for the files beside a mesh, which records missing files."""
 
     def __init__(self, path: Path):
         from trimesh.resolvers import FilePathResolver  # never leaves the folder

@@ -31,21 +31,21 @@ from ._materialx import openpbr_inputs
 
 _SUFFIXES = (".usda", ".usdc", ".usd")
 _FOCAL_LENGTH = 50.0  # focal length of the camera; the aperture follows from it
-_FARTHEST = 1e3  # m, that a camera sees
+_FARTHEST = 1e3  # far clipping distance, m
 
 
 def save_usd(path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None = None) -> None:
     r"""Write a scene as USD: triangles, an OpenPBR material, camera and lights, in meters.
 
-    The color of the subsurface is the albedo of the splats, as the color of the vertices, if there
-    is one; else that of the material. Renderers without OpenPBR show an opaque surface. The image
-    of an `EnvironmentLight` is written beside, as EXR.
+    The color of the subsurface is the albedo of the splats, stored as vertex colors, if there is
+    one; else it is the color of the material. Renderers without OpenPBR show an opaque surface. The
+    image of an `EnvironmentLight` is written beside the file, as EXR.
 
     **Arguments:**
 
     - `mesh`: closed triangles that bound the body, mm; `None` draws a hexagon for each splat.
 
-    A warning names lights that USD does not have.
+    A warning names lights that USD cannot store.
 
     **Raises:** `ValueError` for another suffix than .usda, .usdc or .usd, without usd-core, or for
     a material of neither one nor three channels; `OSError` if the file cannot be written.

@@ -18,12 +18,12 @@ from splatjax._records import Numbers, as_floats, check_values, is_traced, numbe
 from ._medium import Layer, Medium, reflectance
 from ._quadrature import unit_legendre
 
-ANGULAR_POWERS = 5  # of the law that is fitted
-_HALVINGS = 24  # of the interval in which a similarity parameter lies
-_OUTSIDE, _BEYOND = 12, 8  # cosines: refracted, and beyond the critical angle
-_MOMENTS = 12  # of the phase function
+ANGULAR_POWERS = 5  # number of powers in the fitted law
+_HALVINGS = 24  # bisections in the search for a similarity parameter
+_OUTSIDE, _BEYOND = 12, 8  # numbers of cosines: refracted, and beyond the critical angle
+_MOMENTS = 12  # number of moments of the phase function
 _LEAST_COSINE = 1e-4
-_DEPTH = 0.05  # of the first layer of a half space, in mean free paths
+_DEPTH = 0.05  # depth of the first layer of a half space, mean free paths
 _DOUBLINGS, _COVER_DOUBLINGS = 18, 8
 
 
@@ -153,8 +153,8 @@ class HalfSpace(eqx.Module):
 
     @jit_unless_traced
     def directional_albedo(self) -> Float[Array, "angles channels"]:
-        """Compute the fraction of light, entering at each of `cosines`, that leaves, within 3e-4.
-        Energy is conserved by construction.
+        """Compute the fraction of the light entering at each of `cosines` that leaves again, within
+        3e-4. Energy is conserved by construction.
         """
         return self._by_channel(_directional_albedo).T
 
@@ -164,8 +164,8 @@ class HalfSpace(eqx.Module):
 
     @jit_unless_traced
     def color(self) -> Float[Array, " channels"]:
-        """Compute the color of a flat surface under even light: the fraction of the light that has
-        entered and leaves again. Light that the surface itself reflects does not count.
+        """Compute the color of a flat surface under even light: the fraction of the entered light
+        that leaves again. Light reflected by the surface itself does not count.
         """
         return self._by_channel(_diffuse_albedo)
 
@@ -240,8 +240,8 @@ def _directional_albedo(albedo_prime, eta, g, cover=None) -> Float[Array, " angl
 
 
 def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
-    """Return the transmission and reflection, between all cosines, of a layer of a reduced optical
-    depth, or of a half space.
+    """Return the transmission and reflection, between all cosines, of a layer with a given reduced
+    optical depth, or of a half space.
     """
     even, odd, albedo, extinction = _redistribution(mu, weights, albedo_prime, g)
     doublings = _DOUBLINGS if optical_depth is None else _COVER_DOUBLINGS
@@ -277,7 +277,7 @@ def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
 
 
 def _diffuse_albedo(albedo_prime, eta, g, cover=None) -> Float[Array, ""]:
-    """Compute the fraction that leaves of diffuse light that has entered."""
+    """Compute the fraction of entered diffuse light that leaves again."""
     mu, weights, reflected = (values[: _OUTSIDE + 1] for values in _directions(eta))
     entering = mu * weights * (1 - reflected)
     return jnp.vdot(entering, _directional_albedo(albedo_prime, eta, g, cover)) / jnp.sum(entering)
@@ -324,7 +324,7 @@ def _redistribution(mu, weights, albedo_prime, g):
     even, odd = (
         by_moment[parity::2].T @ (legendre[parity::2] * weights[None]) for parity in (0, 1)
     )
-    even = even / jnp.sum(even, axis=1, keepdims=True)  # nothing is lost to rounding
+    even = even / jnp.sum(even, axis=1, keepdims=True)  # no energy is lost to rounding
     scattered = albedo_prime * (1 - peak) / (1 - g)
     extinction = scattered + 1 - albedo_prime
     return even, odd, scattered / extinction, extinction

@@ -142,7 +142,7 @@ def check_stack(layers: tuple[Layer | Film, ...]) -> None:
 class AbstractFresnel(eqx.Module):
     r"""The reflectance of a smooth interface for diffuse light from inside.
 
-    With `F(mu)` the internal reflectance, total internal reflection included, and `eta` the index
+    `F(mu)` is the internal reflectance, including total internal reflection, and `eta` is the index
     inside divided by the index outside.
     """
 
@@ -245,7 +245,9 @@ def moment_outside(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
 
 
 def _denser_over_rarer(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """Return the index of the denser over the rarer side; at 1 the derivative is from above."""
+    """Return the index of the denser side divided by that of the rarer side; at 1 the derivative is
+    the limit from above.
+    """
     return jnp.where(eta < 1, 1 / eta, eta)
 
 

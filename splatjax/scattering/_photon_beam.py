@@ -85,8 +85,8 @@ class SingleScattering(AbstractProfile):
         with the cosines `mu'` refracted. Times `mu_o` and integrated over all directions, with
         light along the normal, it is the total reflectance.
 
-        **Arguments:** `mu_i`, `mu_o`: cosines of `wi` and `wo` outside, in [0, 1]; kept above 1e-4.
-        Differentiable.
+        **Arguments:** `mu_i`, `mu_o`: cosines of `wi` and `wo` outside, in [0, 1]; clamped to at
+        least 1e-4. Differentiable.
         """
         shape = (*mu_i.shape, self.channels)
         scattered = jnp.broadcast_to(self.strength * self.medium.albedo_prime, shape)
@@ -228,8 +228,8 @@ class _MultipleScattering(AbstractHalfSpace):
 
 @functools.cache
 def _beam() -> tuple[np.ndarray, np.ndarray]:
-    """Optical depths of sources and their weights `exp(-x) dx`, at equal steps of the logarithm:
-    all scales are resolved.
+    """Compute optical depths of sources and their weights `exp(-x) dx`, at equal steps of the
+    logarithm, so that all scales are resolved.
     """
     logarithm, step = np.linspace(-30.0, 3.9, _NODES, retstep=True)
     x = np.exp(logarithm)

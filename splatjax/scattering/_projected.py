@@ -1,4 +1,4 @@
-"""A spectrum as colors."""
+"""Profiles by wavelength as colors."""
 
 from typing import ClassVar
 

@@ -94,8 +94,8 @@ L2_QUADRATURE = RadialRule(smallest=1e-3, largest=1e4, count=192)
 """For integrals of `r R^2` (Eq. 3 and Eq. 4): the neglected tail of a medium without absorption is
 1e-16 of the integral.
 
-A fit is accurate to the square of its error, which takes many nodes: with 128 an error of 1e-5 is
-wrong by a tenth, with 192 by 1e-7.
+The squared error of a fit must be accurate, which takes many nodes: with 128, an error of 1e-5 is
+wrong by a tenth; with 192, by 1e-7.
 """
 
 L1_QUADRATURE = RadialRule(smallest=1e-3, largest=1e7, count=256)
@@ -113,7 +113,7 @@ class InverseVariance(AbstractRadialRule):
 
     **Attributes:**
 
-    - `among`: the rule that selects radii, in length scales of the profile: by default all,
+    - `among`: the rule that selects radii, in length scales of the profile: all by default, or
       `L2_QUADRATURE.beyond(1.0)` for a cut.
 
     **Raises:** `ValueError`, when used, for a profile that has no `deviation`.
@@ -150,8 +150,8 @@ def _nodes(smallest: float, largest: float, count: int, near: int) -> tuple[np.n
 
 @functools.cache
 def unit_interval() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute nodes x of the interval (0, 1), 1 - x without loss of digits, and weights: for
-    integrands rough at either end.
+    """Compute nodes x of the interval (0, 1), 1 - x without loss of digits, and weights, for
+    integrands that are not smooth at the ends.
 
     Takahasi and Mori's double exponential formula; the error of analytic integrands is about 1e-15.
     """
@@ -178,8 +178,8 @@ def at_own_radii(
 def integrated_reflectance(
     profile: AbstractProfile, rule: RadialRule = L1_QUADRATURE
 ) -> Float[Array, " channels"]:
-    r"""Integrate `2 pi r R(r)` numerically, where `profile.total_reflectance()` has a closed
-    form.
+    r"""Integrate `2 pi r R(r)` numerically, without the closed form of
+    `profile.total_reflectance()`.
 
     **Arguments:**
 
@@ -264,7 +264,8 @@ def inverse_hankel_transform(
 
 @functools.cache
 def _filter() -> tuple[np.ndarray, np.ndarray]:
-    """Abscissas `x` and weights, such that the sum of `w x f(x)` is the integral of `x J0(x) f(x)`.
+    """Compute abscissas `x` and weights `w` such that the sum of `w x f(x)` is the integral of `x
+    J0(x) f(x)`.
 
     With `u = log x` the kernel `exp(u) J0(exp(u))` has the Fourier transform `2^(i w) Gamma((1 + i
     w)/2) / Gamma((1 - i w)/2)`.
@@ -287,8 +288,9 @@ def _filter() -> tuple[np.ndarray, np.ndarray]:
 
 @functools.cache
 def _half_line() -> tuple[np.ndarray, np.ndarray]:
-    """Nodes for integrals over k > 0 of functions like `exp(-k)`, `log k = t - exp(-t)` at equal
-    steps of t; and weights of `k J0(2 k x)` in powers of `x^2`, the highest first: [powers, nodes].
+    """Compute nodes for integrals over k > 0 of functions like `exp(-k)`, with `log k = t -
+    exp(-t)` at equal steps of t; and weights of `k J0(2 k x)` in powers of `x^2`, the highest
+    first: [powers, nodes].
     """
     t, step = np.linspace(-2.6, 3.65, _NEAR_NODES, retstep=True)
     nodes = np.exp(t - np.exp(-t))

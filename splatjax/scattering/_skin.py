@@ -30,7 +30,7 @@ from ._medium import Layer, Medium
 from ._photon_beam import PhotonBeam
 
 _SHORTEST, _LONGEST = 380.0, 780.0  # nm
-# g/mol, and g of hemoglobin in a liter of blood (Prahl).
+# Molar masses, g/mol, and grams of hemoglobin in a liter of blood (Prahl).
 _HEMOGLOBIN, _CAROTENE, _BILIRUBIN, _IN_BLOOD = 64500.0, 536.87, 584.66, 150.0
 _PER_MM = np.log(10) / 10  # from decadic extinction per cm to absorption per mm
 
@@ -172,7 +172,8 @@ class Skin(eqx.Module):
     - `water`: fraction of both layers.
     - `vessel_radius`: mm. Blood in vessels shadows itself, which flattens its absorption bands.
     - `thickness`: thickness of the epidermis, mm; it may be thinner than a mean free path.
-    - `scattering`: reduced coefficient at 500 nm, 1/mm, and `scattering_power`.
+    - `scattering`: reduced scattering coefficient at 500 nm, 1/mm; `scattering_power`: the power of
+      its decrease with the wavelength.
     - `eta`: index of refraction; `g`: mean cosine of the phase function.
     - `wavelengths`: nm, of the channels; by default 400 to 700 in steps of 10.
 

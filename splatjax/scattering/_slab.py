@@ -113,8 +113,8 @@ def slab_response(
     )
 
 
-_SMALL = 0.05**2  # of (s H)^2: below, a series in it leaves 1e-16
-_ENDLESS = 1e12  # mean free paths of a layer of infinite thickness
+_SMALL = 0.05**2  # bound of (s H)^2 below which the series is accurate to 1e-16
+_ENDLESS = 1e12  # mean free paths that replace an infinite thickness
 
 
 def hyperbolic_ratio(
@@ -127,7 +127,7 @@ def hyperbolic_ratio(
     r"""Compute `sinh(s a) cosh(s b) / sinh(s height)` with `s = sqrt(u)`, where `height = a + b +
     fall` and nothing is negative.
 
-    An even function of s, hence smooth in u: a series about `u = 0` keeps its derivatives.
+    It is an even function of s, hence smooth in u; a series about `u = 0` keeps its derivatives.
     """
     small = u * height * height < _SMALL
     # Near 0, as a sum of logarithms of sinh(x) / x and of cosh(x).
@@ -146,7 +146,7 @@ def _log_sinhc(y):
     return y * (1 / 6 - y * (1 / 180 - y * (1 / 2835 - y / 37800)))
 
 
-# In mean free paths; the quadrature does not resolve a source nearer to the surface.
+# Least depth of a source, in mean free paths, that the quadrature resolves.
 _SHALLOWEST = 1e-3
 
 
@@ -267,7 +267,7 @@ class Multipole(AbstractSlabProfile):
     **Attributes:**
 
     - `layer`: medium and thickness.
-    - `eta_above`, `eta_below`, `fresnel`: as `AbstractSlabProfile` has them.
+    - `eta_above`, `eta_below`, `fresnel`: as in `AbstractSlabProfile`.
 
     **Raises:** `ValueError` for a layer thinner than one mean free path `1 / sigma_t'` in any
     channel: its sources would be outside of it. Under `jit` this cannot be checked, and the profile
@@ -303,7 +303,7 @@ class LayeredMultipole(AbstractSlabProfile):
 
     - `layers`: `Layer` and `Film`, from the top; at least one scatters. Only the lowest may be
       infinite.
-    - `eta_above`, `eta_below`, `fresnel`: as `AbstractSlabProfile` has them.
+    - `eta_above`, `eta_below`, `fresnel`: as in `AbstractSlabProfile`.
 
     **Raises:** `ValueError` for no scattering layer, for numbers of channels that differ, for an
     infinite layer with another below it, and for a layer thinner than one mean free path `1 /

@@ -12,13 +12,13 @@ from splatjax.gaussians import AbstractProfile
 # Fraction of the peak above which pixels determine the center.
 _CORE = 0.2
 
-# Of a ring: with fewer, its scatter hardly determines the error of its mean.
+# Least pixels of a ring; with fewer, their scatter hardly determines the error of the mean.
 _LEAST_PIXELS = 12
 
 
 @record
 class Tabulated(AbstractProfile):
-    r"""A profile given at radii, linear in between: constant within the first radius, 0 beyond the
+    r"""A profile given at radii, linear between them, constant within the first and 0 beyond the
     last.
 
     Nothing is extrapolated: light beyond the last radius counts only if `total` is given.
@@ -30,7 +30,7 @@ class Tabulated(AbstractProfile):
     - `radii`: mm, at least two; they ascend from at least 0.
     - `values`: 1/mm^2, one row per radius. Noise may make them negative.
     - `deviation`: standard errors of the values, with the same shape, or None if they are unknown.
-      Constants of every derivative.
+      Derivatives treat them as constants.
     - `total`: the total reflectance of each channel; None for the integral of the straight lines.
 
     **Raises:** `ValueError` for radii that do not ascend, for values that are not finite, and for
@@ -68,7 +68,7 @@ class Tabulated(AbstractProfile):
         return jnp.stack(columns, axis=-1).reshape(*r.shape, -1)
 
     def without(self, profile: AbstractProfile) -> "Tabulated":
-        """Subtract a profile: single scattering, for a fit of the rest."""
+        """Subtract a profile, such as single scattering, to fit the rest."""
         if profile.singular:
             requirement = (
                 f"above 0, because {type(profile).__name__} is infinite at r = 0; leave that "
