@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from splatjax._chunking import take_points
+from splatjax._chunking import jit_unless_traced, take_points
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
@@ -22,9 +22,9 @@ from ._diffuser import (
     Sources,
     layer_values,
 )
-from ._gaussian_sums import SourceTable, Targets, gaussian_sums
+from ._gaussian_sums import SourceTable, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
-from ._neighbors import Boxes, Neighbors, find_neighbors
+from ._neighbors import Boxes, Lists, Neighbors, find_neighbors
 
 # Quantile of the areas of the splats: a layer is resolved as far as splats of that area resolve it.
 FINE_QUANTILE = 0.01
@@ -157,22 +157,20 @@ class ClusterPlan(AbstractDiffusionPlan):
 
         # Sink the sources and merge them; sum over those near each block of points.
         below = self.sources.merged(centered, depths)
-        targets = Targets.of(at, points.shape[1] // POINTS_PER_BLOCK, POINTS_PER_BLOCK)
-        lists = self.neighbors.lists
-        if at is not None:
-            lists = lists.only(jnp.any(targets.ranks < targets.count, axis=1))
-        sums = gaussian_sums(
-            in_units(points.reshape(3, -1, POINTS_PER_BLOCK).swapaxes(0, 1), layer_variances),
-            source_table(below, layer_variances, self.sources.layers),
-            lists,
+        sums = layer_sums(
+            points.reshape(3, -1, POINTS_PER_BLOCK).swapaxes(0, 1),
+            below,
+            self.sources.layers,
+            self.neighbors.lists,
+            layer_variances,
             self.kernels,
-            targets,
-            self.forward_mode,
+            at,
+            forward_mode=self.forward_mode,
         )
         per_mm = units_per_mm(layer_variances)[:, None]
         seen = points if at is None else take_points(points, at)
         layers = jax.checkpoint(layer_values)(  # keeps the sums alone for the derivative
-            sums.reshape(len(layer_variances), -1, 4, targets.count),
+            sums.reshape(len(layer_variances), -1, 4, seen.shape[1]),
             per_mm[:, None] * seen[None],
             2 * per_mm,  # slopes are moments in mm over v, and moments are in units of sqrt(2 v)
             per_flat_mass(self.kernels, layer_variances, depths)[:, None],
@@ -189,25 +187,33 @@ class ClusterPlan(AbstractDiffusionPlan):
         return Diffused(layers, combination.largest([needed.astype(variances.dtype)]))
 
 
-def in_units(
-    points: Float[Array, "blocks 3 block"], variances: Float[Array, " layers"]
-) -> Float[Array, "layers blocks 3 block"]:
-    """Express points, mm, in the unit of length of every layer."""
-    return units_per_mm(variances)[:, None, None, None] * points[None]
-
-
-def source_table(
+@jit_unless_traced
+def layer_sums(
+    points: Float[Array, "blocks 3 block"],
     below: SunkSources,
+    layers: Int[Array, " source_blocks"],
+    lists: Lists,
     variances: Float[Array, " layers"],
-    layers: Int[Array, " blocks"],
+    kernels: TruncatedGaussian,
+    at: Int[Array, " targets"] | None = None,
     moments: bool = True,
-) -> SourceTable:
-    """Arrange the sources of all layers: light and mass, with their first moments if requested."""
-    units = units_per_mm(variances)[layers][None, :, None]
-    centers = below.centers.reshape(3, -1, SOURCES_PER_BLOCK) * units
+    forward_mode: bool = False,
+) -> Float[Array, "layers sums targets"]:
+    """Sum the light in each channel and the mass of the sources of every layer around points, as
+    `gaussian_sums`; each is followed by its first moments if requested.
+
+    **Arguments:**
+
+    - `points`: mm, from the origin of the sources.
+    - `layers`: the layer of every block of sources.
+    """
+    per_mm = units_per_mm(variances)
+    centers = below.centers.reshape(3, -1, SOURCES_PER_BLOCK) * per_mm[layers][None, :, None]
     light = below.areas[None] * jnp.pad(below.irradiance, ((0, 1), (0, 0)), constant_values=1)
     rows = light.reshape(len(light), -1, SOURCES_PER_BLOCK)
-    return SourceTable(tuple(centers), tuple(rows), moments)
+    table = SourceTable(tuple(centers), tuple(rows), moments)
+    in_units = per_mm[:, None, None, None] * points[None]
+    return gaussian_sums(in_units, table, lists, kernels, at, forward_mode)
 
 
 def per_flat_mass(

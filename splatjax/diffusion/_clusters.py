@@ -50,7 +50,6 @@ class LayerSources(eqx.Module):
         normals: Float[np.ndarray, "splats 3"],
         exists: Bool[np.ndarray, " splats"],
         edges: Sequence[float],
-        least: int = 0,
     ) -> "LayerSources":
         """Choose the sources of layers.
 
@@ -61,7 +60,6 @@ class LayerSources(eqx.Module):
 
         - `exists`: false for splats that fill a block.
         - `edges`: of the cells of each layer, mm; 0 for single splats, inf for none.
-        - `least`: capacity at least.
         """
         cells = sorted({edge for edge in edges if 0 < edge < np.inf})
         nested = dict(zip(cells, nested_cells(centers, normals, exists, cells), strict=True))
@@ -75,7 +73,7 @@ class LayerSources(eqx.Module):
         count = SOURCES_PER_BLOCK * len(layers)
         capacity = max(-(-count // half), -(-3 * len(edges) // 2)) * half
         capacity = reuse_capacity(("sources", len(exists), len(edges)), count, capacity)
-        lacking = max(capacity, least) // SOURCES_PER_BLOCK - len(layers)
+        lacking = capacity // SOURCES_PER_BLOCK - len(layers)
         layers = np.pad(layers, (0, lacking))
         return cls(jnp.asarray(parents, jnp.int32), jnp.asarray(layers, jnp.int32))
 

@@ -244,16 +244,6 @@ class AbstractDiffuser(eqx.Module):
         """
 
 
-def divide_by_mass(
-    sums: Float[Array, "*rows values points"],
-) -> Float[Array, "*rows values points"]:
-    """Divide the light of each channel by the mass, which comes last; 0 where nothing is in
-    reach.
-    """
-    light, mass = _light_and_mass(sums, -2)
-    return jnp.concatenate([light / jnp.where(mass > 0, mass, 1.0), mass], axis=-2)
-
-
 def _light_and_mass(rows: Float[Array, "..."], axis: int) -> Sequence[Float[Array, "..."]]:
     """Separate the channels from the mass. The derivative of slices would be a sum."""
     axis %= rows.ndim

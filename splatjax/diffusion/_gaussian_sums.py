@@ -7,6 +7,8 @@ of its list. The unit of length is the layer's standard deviation times the root
 """
 
 import functools
+import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -17,8 +19,9 @@ from splatjax._chunking import zeros_after
 from splatjax._precision import full_precision
 
 from ._kernel import TruncatedGaussian
-from ._neighbors import Lanes, Lists
+from ._neighbors import Lists
 
+LANES = 256  # lists that are swept together
 FAR = -1e6  # coordinate far from all points in every unit used, with a square finite in float32
 
 
@@ -86,100 +89,113 @@ class SourceTable(eqx.Module):
         return jax.tree.map(added, self, cotangents)
 
 
-class Targets(eqx.Module):
-    """The points at which sums are computed.
+class Lanes(eqx.Module):
+    """Lists that are swept together, one per lane.
 
     **Attributes:**
 
+    - `lists`: the list of each lane; empty lanes hold distinct numbers beyond all lists.
+    - `first`, `counts`: first row and number of rows of each list.
+    - `rows`: the rows of all lists.
+    - `kernels`, `points`: of each lane.
+    - `places`: indices of the layer, of all sums, and of the points among the sums.
+    """
+
+    lists: Int[Array, " lanes"]
+    first: Int[Array, " lanes"]
+    counts: Int[Array, " lanes"]
+    rows: Int[Array, "rows width"]
+    kernels: TruncatedGaussian
+    points: Float[Array, "lanes 3 block"]
+    places: tuple
+
+    def each_row(self, table: SourceTable, add: Callable, start):
+        """Apply `add(ids, sources, weights, minus_slopes, carry)` to row after row: the blocks of
+        sources `[lanes, width]`, the sources, and of every source at every point `[lanes, sources,
+        points]` the weight, and minus its derivative in the exponent.
+        """
+
+        def step(i, carry):
+            row = jnp.where(i < self.counts, self.first + i, len(self.rows) - 1)
+            ids = self.rows.at[row].get(mode="promise_in_bounds")
+            sources = table.gather(ids)
+            dx, dy, dz = (
+                self.points[:, axis, None] - center[:, :, None]
+                for axis, center in enumerate(sources.centers)
+            )
+            return add(ids, sources, *self.kernels(dx * dx + dy * dy + dz * dz), carry)
+
+        return jax.lax.fori_loop(0, jnp.max(self.counts), step, start)
+
+
+class _Sweep(eqx.Module):
+    """The lists that are swept, and the targets: the points at which sums are computed. Not
+    differentiated.
+
+    **Attributes:**
+
+    - `kernels`: of each layer.
     - `ranks`: the index of each point among the targets, in any order; for other points, distinct
       numbers from `count` on.
     - `count`: the number of targets. Static.
     """
 
+    kernels: TruncatedGaussian
+    lists: Lists
     ranks: Int[Array, "points_blocks block"]
     count: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, at: Int[Array, " targets"] | None, blocks: int, block: int) -> "Targets":
-        """Choose the points `at` of all points in blocks, beyond all for none; all for `None`."""
-        every = jnp.arange(blocks * block, dtype=jnp.int32)
+    def of(
+        cls,
+        kernels: TruncatedGaussian,
+        lists: Lists,
+        at: Int[Array, " targets"] | None,
+        shape: tuple[int, int],
+    ) -> "_Sweep":
+        """Choose the points `at` of all points, in blocks of a shape."""
+        count = math.prod(shape)
+        every = jnp.arange(count, dtype=jnp.int32)
         if at is None:
-            return cls(every.reshape(blocks, block), blocks * block)
-        ranks = (every + len(at)).at[at].set(every[: len(at)], mode="drop")
-        return cls(ranks.reshape(blocks, block), len(at))
+            return cls(kernels, lists, every.reshape(shape), count)
+        ranks = (every + len(at)).at[at].set(every[: len(at)], mode="drop").reshape(shape)
+        return cls(kernels, lists.only(jnp.any(ranks < len(at), axis=1)), ranks, len(at))
 
-    def _at(self, lanes: Lanes) -> tuple:
-        """Index the layer, all sums, and the points of each lane."""
-        layer, block = jnp.divmod(lanes.lists, len(self.ranks))
-        return layer[:, None], slice(None), self.ranks[block]
+    def sweep(self, sweep: Callable, points: Float[Array, "lists 3 block"], out):
+        """Apply `sweep(lanes, out)` to all lists with a row, `LANES` of them at a time."""
+        lists, count = self.lists, len(self.lists.order)
+        lanes = min(LANES, count)
+        order = jnp.append(lists.order, jnp.arange(count, count + -count % lanes, dtype=jnp.int32))
+        sweeps = (jnp.sum(lists.counts > 0) + lanes - 1) // lanes
 
-    def write(
-        self,
-        sums: Float[Array, "layers sums targets"],
-        lanes: Lanes,
-        values: Float[Array, "lanes sums block"],
-    ) -> Float[Array, "layers sums targets"]:
-        # No place is written twice; else the derivative searches for the last of several values.
-        places = sums.at[self._at(lanes)]
-        return places.set(jnp.swapaxes(values, 1, 2), mode="drop", unique_indices=True)
-
-    def read(
-        self, sums: Float[Array, "layers sums targets"], lanes: Lanes
-    ) -> Float[Array, "lanes sums block"]:
-        """Read the values that `write` wrote; 0 for other points."""
-        return jnp.swapaxes(sums.at[self._at(lanes)].get(mode="fill", fill_value=0), 1, 2)
-
-
-class _Sweep(eqx.Module):
-    """The common state of all sweeps. Not differentiated."""
-
-    kernels: TruncatedGaussian
-    lists: Lists
-    targets: Targets
-
-    def sweep(self, sweep, points, out):
-        """Apply `sweep(lanes, kernels of the lanes, points of the lanes, out)` to all lists."""
-
-        def with_points(lanes: Lanes, out):
-            layer = lanes.lists // len(self.targets.ranks)
-            kernels = jax.tree.map(lambda leaf: leaf.at[layer].get(mode="clip"), self.kernels)
-            return sweep(lanes, kernels, lanes.read(points, FAR), out)
-
-        return self.lists.sweep(with_points, out)
-
-    def sums(self, points, table: SourceTable, add):
-        """Sum over all sources of the points: `add(lanes, ids, kernels, points, sums)`."""
-        block = points.shape[2]
-
-        def sweep(lanes: Lanes, kernels, x, out):
-            start = jnp.zeros((len(x), table.count, block), x.dtype)
-            lane_sums = lanes.each_row(
-                self.lists, lambda ids, sums: add(lanes, ids, kernels, x, sums), start
+        def step(i, out):
+            of_lanes = jax.lax.dynamic_slice_in_dim(order, i * lanes, lanes)
+            first, counts = (
+                table.at[of_lanes].get(mode="fill", fill_value=0)
+                for table in (lists.first, lists.counts)
             )
-            return self.targets.write(out, lanes, lane_sums)
+            layer, block = jnp.divmod(of_lanes, len(self.ranks))
+            kernels = jax.tree.map(lambda leaf: leaf.at[layer].get(mode="clip"), self.kernels)
+            here = points.at[of_lanes].get(mode="fill", fill_value=FAR)
+            places = layer[:, None], slice(None), self.ranks[block]
+            return sweep(Lanes(of_lanes, first, counts, lists.rows, kernels, here, places), out)
 
-        layers = len(self.kernels.largest)
-        out = zeros_after(table.rows[0], (layers, table.count, self.targets.count), points.dtype)
-        return self.sweep(sweep, points, out)
-
-
-def _weigh(kernels: TruncatedGaussian, points, sources: SourceTable):
-    """Compute weights `[lanes, sources, points]`, minus their derivatives in the exponent, and
-    offsets.
-    """
-    dx, dy, dz = (
-        points[:, axis, None] - center[:, :, None] for axis, center in enumerate(sources.centers)
-    )
-    return *kernels(dx * dx + dy * dy + dz * dz), (dx, dy, dz)
+        return jax.lax.fori_loop(jnp.zeros_like(sweeps), sweeps, step, out)
 
 
 def _forward(sweeps: _Sweep, points, table: SourceTable):
-    def add(lanes, ids, kernels, x, sums):
-        sources = table.gather(ids)
-        weights, *_ = _weigh(kernels, x, sources)
+    def add(_ids, sources: SourceTable, weights, _slopes, sums):
         return sums + jnp.einsum("lrs,lsp->lrp", sources.rows_and_moments(), weights)
 
-    return sweeps.sums(points, table, add)
+    def sweep(lanes: Lanes, sums):
+        lane_sums = jnp.zeros((len(lanes.points), table.count, points.shape[2]), points.dtype)
+        lane_sums = lanes.each_row(table, add, lane_sums)
+        # No place is written twice; else the derivative searches for the last of several values.
+        places = sums.at[lanes.places]
+        return places.set(jnp.swapaxes(lane_sums, 1, 2), mode="drop", unique_indices=True)
+
+    shape = len(sweeps.kernels.largest), table.count, sweeps.count
+    return sweeps.sweep(sweep, points, zeros_after(table.rows[0], shape, points.dtype))
 
 
 @full_precision
@@ -196,28 +212,22 @@ def _backward(residuals, cotangents):
     """
     sweeps, points, table = residuals
 
-    def sweep(lanes: Lanes, kernels, lane_points, carry):
-        d_points, d_table = carry
-        cotangent = sweeps.targets.read(cotangents, lanes)
+    def sweep(lanes: Lanes, carry):
+        cotangent = cotangents.at[lanes.places].get(mode="fill", fill_value=0).swapaxes(1, 2)
 
-        def add(ids, carry):
+        def add(ids, sources: SourceTable, weights, minus_slopes, carry):
             d_here, d_table = carry
-            sources = table.gather(ids)
-            weights, minus_slopes, _ = _weigh(kernels, lane_points, sources)
             centers = jnp.stack(sources.centers, axis=1)
             origin = centers[:, :, :1]
-            x, p = lane_points - origin, centers - origin
+            x, p = lanes.points - origin, centers - origin
             _, pull_rows = jax.vjp(SourceTable.rows_and_moments, sources)
             g = minus_slopes * sources.contract(cotangent)
             # Sum over the points: the cotangents of the sources.
             one_and_x = jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1)
             over_points = jnp.einsum("lkp,lsp->lks", one_and_x, g)
-            d_rows = jnp.einsum("lrp,lsp->lrs", cotangent, weights)
-            d_centers = 2 * (over_points[:, 1:] - p * over_points[:, :1])
-            (d_sources,) = pull_rows(d_rows)
-            d_centers = jax.tree.map(
-                jnp.add, d_sources.centers, tuple(jnp.unstack(d_centers, axis=1))
-            )
+            (d_sources,) = pull_rows(jnp.einsum("lrp,lsp->lrs", cotangent, weights))
+            d_centers = jnp.unstack(2 * (over_points[:, 1:] - p * over_points[:, :1]), axis=1)
+            d_centers = jax.tree.map(jnp.add, d_sources.centers, tuple(d_centers))
             d_sources = SourceTable(d_centers, d_sources.rows, table.moments)
             # Sum over the sources: the cotangents of the points.
             one_and_p = jnp.concatenate([jnp.ones_like(p[:, :1]), p], axis=1)
@@ -225,8 +235,9 @@ def _backward(residuals, cotangents):
             d_here = d_here - 2 * (x * over_sources[:, :1] - over_sources[:, 1:])
             return d_here, d_table.scatter_add(ids, d_sources)
 
-        d_here, d_table = lanes.each_row(sweeps.lists, add, (jnp.zeros_like(lane_points), d_table))
-        return lanes.write(d_points, d_here), d_table
+        d_points, d_table = carry
+        d_here, d_table = lanes.each_row(table, add, (jnp.zeros_like(lanes.points), d_table))
+        return d_points.at[lanes.lists].set(d_here, mode="drop"), d_table
 
     start = jax.tree.map(
         lambda array: zeros_after(cotangents, array.shape, array.dtype), (points, table)
@@ -246,7 +257,7 @@ def gaussian_sums(
     table: SourceTable,
     lists: Lists,
     kernels: TruncatedGaussian,
-    targets: Targets,
+    at: Int[Array, " targets"] | None = None,
     forward_mode: bool = False,
 ) -> Float[Array, "layers sums targets"]:
     r"""Sum `rows_j exp(-|x - p_j|^2)` over the blocks of sources in the list of every point.
@@ -256,10 +267,10 @@ def gaussian_sums(
     - `points`: `x`, in the unit of each layer. Differentiable.
     - `table`: `p_j` and `rows_j` of all layers. Differentiable.
     - `kernels`: of each layer; they replace `exp`. Terms beyond their rims vanish for any list.
-    - `targets`: the points of the sums.
+    - `at`: the points of the sums, beyond all points for none; all for `None`.
     - `forward_mode`: differentiable only in forward mode, otherwise only in reverse mode. Static.
     """
-    sweeps = _Sweep(kernels, lists, targets)
+    sweeps = _Sweep.of(kernels, lists, at, (points.shape[1], points.shape[3]))
     # The loops have their own derivatives in forward mode.
     sums = _forward if forward_mode else _sums
     return sums(sweeps, points.reshape(-1, *points.shape[2:]), table)

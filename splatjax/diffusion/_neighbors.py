@@ -1,7 +1,9 @@
-"""Lists of the blocks of sources near each block of points: search (once a geometry) and sweep."""
+"""Lists of the blocks of sources near each block of points: the search, once
+a geometry.
+"""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -14,7 +16,6 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax._chunking import with_spare
 
 BLOCKS_PER_ROW = 16  # blocks of sources in a row of a list
-LANES = 256  # blocks of points that are swept together
 _ROWS = 7  # least rows per list, more than most bodies need, so that bodies share a program
 _AT_ONCE = 1 << 13  # pairs of boxes whose parts are tested together, few enough for the cache
 _FAN = 4  # parts of a box of a coarser level
@@ -46,46 +47,6 @@ class Lists(eqx.Module):
         # A stable sort: those without a row come last.
         order = self.order[jnp.argsort(counts[self.order] == 0)]
         return Lists(self.rows, self.first, counts, order)
-
-    def sweep(self, sweep: Callable, out):
-        """Apply `sweep(lanes, out)` to all lists with a row, `LANES` of them at a time."""
-        count = len(self.order)
-        lanes = min(LANES, count)
-        order = jnp.append(self.order, jnp.arange(count, count + -count % lanes, dtype=jnp.int32))
-        sweeps = (jnp.sum(self.counts > 0) + lanes - 1) // lanes
-
-        def step(i, out):
-            of_lanes = jax.lax.dynamic_slice_in_dim(order, i * lanes, lanes)
-            first, counts = (
-                table.at[of_lanes].get(mode="fill", fill_value=0)
-                for table in (self.first, self.counts)
-            )
-            return sweep(Lanes(of_lanes, first, counts), out)
-
-        return jax.lax.fori_loop(jnp.zeros_like(sweeps), sweeps, step, out)
-
-
-class Lanes(eqx.Module):
-    """Lists that are swept together; empty lanes hold distinct numbers beyond all lists."""
-
-    lists: Int[Array, " lanes"]
-    first: Int[Array, " lanes"]
-    counts: Int[Array, " lanes"]
-
-    def read(self, rows: Float[Array, "lists ..."], fill=0.0):
-        return rows.at[self.lists].get(mode="fill", fill_value=fill)
-
-    def write(self, rows: Float[Array, "lists ..."], values):
-        return rows.at[self.lists].set(values, mode="drop")
-
-    def each_row(self, lists: Lists, add: Callable, start):
-        """Apply `add(ids, carry)` to the blocks of sources `[lanes, width]` of row after row."""
-
-        def step(i, carry):
-            row = jnp.where(i < self.counts, self.first + i, len(lists.rows) - 1)
-            return add(lists.rows.at[row].get(mode="promise_in_bounds"), carry)
-
-        return jax.lax.fori_loop(0, jnp.max(self.counts), step, start)
 
 
 class Boxes(eqx.Module):
@@ -147,7 +108,6 @@ def find_neighbors(
     layers: Int[Array, " blocks"] | Int[np.ndarray, " blocks"],
     reaches: Sequence[float],
     parts: int = 1,
-    least: int = 0,
 ) -> Lists:
     """Search for the blocks of sources within reach of every block of points, layer by layer.
 
@@ -159,7 +119,6 @@ def find_neighbors(
     - `layers`: the layer of each block of sources.
     - `reaches`: the reach of each layer, mm; with 0 a layer has no neighbors.
     - `parts`: number of equal parts of the points, one after the other, with separate lists.
-    - `least`: least number of rows of each part.
     """
     low, high = sources.corners
     corners = (np.split(corner, parts) for corner in points.corners)
@@ -184,7 +143,7 @@ def find_neighbors(
             tables.append((rows, np.cumsum(counts) - counts, counts, order))
     # At least one row, the last, stays empty: lanes whose list has ended read it.
     most = max(len(rows) for rows, *_ in tables)
-    count = max(least, _ROWS * lists, with_spare(("rows", lists), most, 1, per_octave=2))
+    count = max(_ROWS * lists, with_spare(("rows", lists), most, 1, per_octave=2))
     padded = [
         (np.pad(rows, ((0, count - len(rows)), (0, 0)), constant_values=len(low)), *columns)
         for rows, *columns in tables

@@ -11,20 +11,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from splatjax._combination import PartByPart
-from splatjax._precision import full_precision
 
-from ._clustered import (
-    ClusterDiffuser,
-    in_units,
-    per_flat_mass,
-    source_boxes,
-    source_table,
-)
-from ._clusters import LayerSources, SunkSources, compact_order
-from ._diffuser import Sources, divide_by_mass
-from ._gaussian_sums import FAR, Targets, gaussian_sums
+from ._clustered import ClusterDiffuser, layer_sums, per_flat_mass, source_boxes
+from ._clusters import LayerSources, compact_order
+from ._diffuser import Sources
+from ._gaussian_sums import FAR
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
-from ._neighbors import Boxes, Lists, find_neighbors, pairs_in_reach
+from ._neighbors import Boxes, find_neighbors, pairs_in_reach
 
 
 class StreamedDiffusion:
@@ -60,7 +53,6 @@ class StreamedDiffusion:
         self.boxes = Boxes.around(
             jnp.moveaxis(self.points, 1, 0).reshape(3, -1), exists.reshape(-1), points.shape[2]
         )
-        self.source_capacity, self.list_capacity = 0, 0
 
     def evaluate(
         self, parts: Iterable[Sources], channels: int
@@ -80,7 +72,7 @@ class StreamedDiffusion:
         count = self.points.shape[0] * self.points.shape[2]
         zeros = jnp.zeros((len(self.edges), channels + 1, count), self.points.dtype)
         sums = PartByPart().fold(add, zeros, parts)
-        return _finished(sums, self.variances, self.depths, self.kernels, self.points)
+        return _means_and_mass(sums, self.variances, self.depths, self.kernels, self.points)
 
     def _in_reach(self, sources: Sources) -> bool:
         """Test by boxes whether a part may contribute to any point."""
@@ -93,27 +85,20 @@ class StreamedDiffusion:
         order = compact_order(np.asarray(sources.centers.T))
         sources = jax.tree.map(lambda rows: rows[..., order], sources.of_layers(self.gaussians))
         arrays = (np.asarray(rows.T) for rows in (sources.centers, sources.normals))
-        exists = np.asarray(sources.areas) > 0
-        clusters = LayerSources.build(*arrays, exists, self.edges, self.source_capacity)
-        self.source_capacity = max(self.source_capacity, clusters.count)
-        below = clusters.merged(sources, self.depths)
-        lists = find_neighbors(
-            self.boxes, source_boxes(below), clusters.layers, self.reaches, least=self.list_capacity
+        clusters = LayerSources.build(*arrays, np.asarray(sources.areas) > 0, self.edges)
+        below, layers = clusters.merged(sources, self.depths), clusters.layers
+        lists = find_neighbors(self.boxes, source_boxes(below), layers, self.reaches)
+        return layer_sums(
+            self.points, below, layers, lists, self.variances, self.kernels, moments=False
         )
-        self.list_capacity = len(lists.rows)
-        return _sum(self.points, below, clusters, self.variances, self.kernels, lists)
-
-
-@full_precision
-@eqx.filter_jit
-def _sum(points, below: SunkSources, clusters: LayerSources, variances, kernels, lists: Lists):
-    table = source_table(below, variances, clusters.layers, moments=False)
-    targets = Targets.of(None, points.shape[0], points.shape[2])
-    return gaussian_sums(in_units(points, variances), table, lists, kernels, targets)
 
 
 @eqx.filter_jit
-def _finished(sums, variances, depths, kernels: TruncatedGaussian, points):
-    rows = divide_by_mass(sums)
-    rows = rows.at[:, -1].multiply(per_flat_mass(kernels, variances, depths)[:, None])
+def _means_and_mass(sums, variances, depths, kernels: TruncatedGaussian, points):
+    """Divide the light of each channel by the mass, which comes last; 0 where nothing is in
+    reach.
+    """
+    light, mass = sums[:, :-1], sums[:, -1:]
+    per_flat = per_flat_mass(kernels, variances, depths)[:, None, None]
+    rows = jnp.concatenate([light / jnp.where(mass > 0, mass, 1.0), per_flat * mass], axis=1)
     return jnp.moveaxis(rows.reshape(*rows.shape[:2], points.shape[0], points.shape[2]), 2, 0)
