@@ -183,9 +183,7 @@ class LayersAtPoints(eqx.Module):
           multiplied by them.
         - `single_scattering_albedo`: the fraction that leaves a flat surface as single scattering.
         """
-        weights, variances = gaussians.weights[:, :, None], self.variances[:, None, None]
-        mass = self.mass[:, None]
-        return self._weigh(weights, variances, single_scattering_albedo, self.means, mass)
+        return self._weigh(gaussians.weights[:, :, None], None, single_scattering_albedo)
 
     def linear_in_means(
         self, gaussians: SumOfGaussians, single_scattering_albedo: Float[Array, " channels"]
@@ -198,8 +196,8 @@ class LayersAtPoints(eqx.Module):
         gain, resolved, local = self._gain(
             weights, variances, single_scattering_albedo, self.mass[:, None]
         )
-        gain = weights * gain
-        return jnp.sum(gain * (1 - resolved) * local, axis=0), gain * resolved
+        factors = weights * gain
+        return jnp.sum(factors * (1 - resolved) * local, axis=0), factors * resolved
 
     def _gain(self, weights, variances, single_scattering_albedo, mass):
         """Compute the factor of each layer, the fraction that is the diffusion integral, and the
@@ -220,7 +218,17 @@ class LayersAtPoints(eqx.Module):
         )
         return root * gain, resolved, local
 
-    def _weigh(self, weights, variances, single_scattering_albedo, means, mass):
+    def _weigh(self, weights, variances, single_scattering_albedo):
+        """Compute the same as `weigh`, for weights that may depend on the point, and variances that
+        may, and may differ slightly from those of the layers; the same as theirs for `None`.
+        """
+        planned, means, mass = self.variances[:, None, None], self.means, self.mass[:, None]
+        if variances is None or self.derivative is None:
+            variances = planned
+        else:
+            moved = jnp.log(variances / planned)
+            means = means + moved * self.derivative[0]
+            mass = jnp.maximum(mass + moved * self.derivative[1][:, None], 0)
         gain, resolved, local = self._gain(weights, variances, single_scattering_albedo, mass)
         return gain * (local + resolved * (means - local)), resolved[:, 0]
 
@@ -234,18 +242,7 @@ class LayersAtPoints(eqx.Module):
           layers; without it the variances are not used.
         """
         weights, variances = gaussians.weights[:, :, None], gaussians.variances[:, None, None]
-        return self._exitance(weights, variances, jnp.zeros_like(weights[0, :, 0]))
-
-    def _exitance(self, weights, variances, single_scattering_albedo):
-        planned = self.variances[:, None, None]
-        means, mass = self.means, self.mass[:, None]
-        if self.derivative is None:
-            variances = planned
-        else:
-            moved = jnp.log(variances / planned)
-            means = means + moved * self.derivative[0]
-            mass = jnp.maximum(mass + moved * self.derivative[1][:, None], 0)
-        layers, _ = self._weigh(weights, variances, single_scattering_albedo, means, mass)
+        layers, _ = self._weigh(weights, variances, jnp.zeros_like(weights[0, :, 0]))
         return jnp.sum(weights * layers, axis=0)
 
     def exitance_jacobian(
@@ -265,7 +262,8 @@ class LayersAtPoints(eqx.Module):
         inputs = tuple(jnp.broadcast_to(array, self.means.shape) for array in inputs)
 
         def exitance(weights, variances):
-            return self._exitance(weights, variances, single_scattering_albedo)
+            layers, _ = self._weigh(weights, variances, single_scattering_albedo)
+            return jnp.sum(weights * layers, axis=0)
 
         total, pull = jax.vjp(exitance, *inputs)
         return pull(jnp.ones_like(total))
