@@ -46,47 +46,41 @@ class SourceTable(eqx.Module):
         """The number of sums."""
         return len(self.rows) * (4 if self.moments else 1)
 
-    def rows_and_moments(self) -> Float[Array, "blocks sums block"]:
+    def planes(self) -> list[Float[Array, "blocks block"]]:
         """Compute the summed rows and moments."""
         centers = self.centers if self.moments else ()
-        products = [(row, *(row * center for center in centers)) for row in self.rows]
-        return jnp.stack([plane for row in products for plane in row], axis=1)
+        return [plane for row in self.rows for plane in (row, *(row * x for x in centers))]
+
+    def rows_and_moments(self) -> Float[Array, "blocks sums block"]:
+        return jnp.stack(self.planes(), axis=1)
 
     def contract(
         self, cotangents: Float[Array, "lanes sums points"]
     ) -> Float[Array, "lanes sources points"]:
-        """Sum the products of `rows_and_moments` with the cotangents of their sums.
+        """Sum the products of `planes` with the cotangents of their sums.
 
         Written out, so that it is fused with the weights: a gradient takes a fifth less than with a
         matrix product.
         """
-        of_sums = jnp.unstack(cotangents[:, :, None], axis=1)
-        per_row = len(of_sums) // len(self.rows)
-        terms = []
-        for i, row in enumerate(self.rows):
-            of_row, *of_moments = of_sums[i * per_row : (i + 1) * per_row]
-            for center, of_moment in zip(self.centers, of_moments, strict=self.moments):
-                of_row = of_row + center[..., None] * of_moment
-            terms.append(row[..., None] * of_row)
+        both = zip(self.planes(), jnp.unstack(cotangents, axis=1), strict=True)
+        terms = [plane[:, :, None] * cotangent[:, None] for plane, cotangent in both]
         return functools.reduce(jnp.add, terms)
 
     def gather(self, ids: Int[Array, "lanes width"]) -> "SourceTable":
         """Read the blocks of each lane, `[lanes, sources]`."""
-
-        def read(plane):
-            return plane.at[ids].get(mode="fill", fill_value=0).reshape(len(ids), -1)
-
-        return jax.tree.map(read, self)
+        return jax.tree.map(
+            lambda plane: plane.at[ids].get(mode="fill", fill_value=0).reshape(len(ids), -1), self
+        )
 
     def scatter_add(
         self, ids: Int[Array, "lanes width"], cotangents: "SourceTable"
     ) -> "SourceTable":
         """Add to the sources of each lane: the transpose of `gather`."""
-
-        def added(plane, part):
-            return plane.at[ids].add(part.reshape(*ids.shape, -1), mode="drop")
-
-        return jax.tree.map(added, self, cotangents)
+        return jax.tree.map(
+            lambda plane, part: plane.at[ids].add(part.reshape(*ids.shape, -1), mode="drop"),
+            self,
+            cotangents,
+        )
 
 
 class Lanes(eqx.Module):

@@ -2,8 +2,6 @@
 Gaussians.
 """
 
-from typing import ClassVar
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -112,7 +110,7 @@ class LayersAtPoints(eqx.Module):
     factors: Float[Array, "gaussians channels points"] | None = None
 
     # Fields that lie along the points.
-    ALONG_POINTS: ClassVar = (
+    ALONG_POINTS = (
         "means",
         "mass",
         "irradiance",
