@@ -181,8 +181,8 @@ class ClusterPlan(AbstractDiffusionPlan):
         largest = self.kernels.largest.astype(layer_variances.dtype)
         reaches = jnp.sqrt(2 * largest * jax.lax.stop_gradient(layer_variances))
         planned = self.variances[: len(variances)]
-        factors = jnp.maximum(planned / variances, variances / planned)
-        varied = jnp.max(factors, initial=0) / (self.margin * (1 + 1e-6))
+        varied = jnp.max(jnp.maximum(planned / variances, variances / planned), initial=0)
+        varied = varied / (self.margin * (1 + 1e-6))
         needed = jnp.maximum(varied, self.neighbors.needed(*around, reaches))
         return Diffused(layers, combination.largest([needed.astype(variances.dtype)]))
 

@@ -77,11 +77,6 @@ class LayerSources(eqx.Module):
         layers = np.pad(layers, (0, lacking))
         return cls(jnp.asarray(parents, jnp.int32), jnp.asarray(layers, jnp.int32))
 
-    @property
-    def count(self) -> int:
-        """The number of sources."""
-        return SOURCES_PER_BLOCK * len(self.layers)
-
     @jit_unless_traced
     def merged(self, splats: Sources, depths: Float[Array, " layers"]) -> SunkSources:
         """Sink the splats below the surface by the depth of each layer, mm, and merge them. Area
@@ -100,7 +95,8 @@ class LayerSources(eqx.Module):
             return [total.at[parents].add(row, mode="drop") for total, row in both], None
 
         # Sum layer by layer: a sum over all layers at once would copy every row.
-        start = list(jnp.zeros((4 + len(splats.irradiance), self.count), splats.areas.dtype))
+        shape = 4 + len(splats.irradiance), SOURCES_PER_BLOCK * len(self.layers)
+        start = list(jnp.zeros(shape, splats.areas.dtype))
         light = splats.irradiance.swapaxes(0, 1) if own_light else None
         (areas, *rows), _ = jax.lax.scan(add_layer, start, (self.parents, depths, light))
         inverse = 1 / jnp.where(areas > 0, areas, 1.0)

@@ -2,8 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import ClassVar
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -106,7 +105,7 @@ class AbstractDiffusionPlan(eqx.Module):
 
     gaussians: Int[Array, " layers"]
     forward_mode: bool = eqx.field(static=True, default=False, kw_only=True)
-    separate: ClassVar[bool] = True
+    separate = True
 
     def variances_of_layers(self, variances: Float[Array, " gaussians"]) -> Float[Array, " layers"]:
         """Look up the variances of the layers among those of the Gaussians, mm^2; 1 for a padding
@@ -179,8 +178,8 @@ class AbstractDiffusionPlan(eqx.Module):
 
         **Returns:** the layers, and the solution on all splats that `towards` needs.
         """
-        sources, variances = Sources.of(splats, source), material.gaussians.variances
-        return self.diffuse(sources, variances, kernel, combination, at), None
+        sources = Sources.of(splats, source)
+        return self.diffuse(sources, material.gaussians.variances, kernel, combination, at), None
 
     def towards(
         self,
@@ -244,9 +243,8 @@ class AbstractDiffuser(eqx.Module):
         """
 
 
-def _light_and_mass(rows: Float[Array, "..."], axis: int) -> Sequence[Float[Array, "..."]]:
+def _light_and_mass(rows: Float[Array, "..."], axis: int) -> list[Float[Array, "..."]]:
     """Separate the channels from the mass. The derivative of slices would be a sum."""
-    axis %= rows.ndim
     return jax.lax.split(rows, (rows.shape[axis] - 1, 1), axis=axis)
 
 
@@ -265,7 +263,7 @@ def layer_values(
     - `per_mm`: the factor from the unit of the places to the unit of the slopes.
     - `per_flat`: the factor from the mass to the mass relative to a flat sheet.
     """
-    total, first_moments = jax.lax.split(sums, (1, 3), axis=sums.ndim - 2)
+    total, first_moments = jax.lax.split(sums, (1, 3), axis=-2)
     # grad N = sum w E (q - x) / v, and grad (N / D) = (grad N - (N / D) grad D) / D.
     of_light, of_mass = _light_and_mass(first_moments - total * points[..., None, :, :], -3)
     light, mass = _light_and_mass(total[..., 0, :], -2)

@@ -152,14 +152,20 @@ def padded_count(count: int) -> int:
     return -(-count // SIZES[-1]) * SIZES[-1]
 
 
+def padded(rows: PyTree[Array]) -> PyTree[Array]:
+    """Append zeros along the last axis, the splats, to complete clusters of all levels."""
+
+    def with_zeros(row):
+        count = row.shape[-1]
+        return jnp.pad(row, [(0, 0)] * (row.ndim - 1) + [(0, padded_count(count) - count)])
+
+    return jax.tree.map(with_zeros, rows)
+
+
 def cluster_totals(rows: Float[Array, "*rows splats"]) -> Float[Array, "*rows clusters"]:
     """Sum over the clusters of every level except the first."""
-    levels, width = [], SIZES[1]
-    for _ in SIZES[1:]:
-        rows = jnp.sum(rows.reshape(*rows.shape[:-1], -1, width), axis=-1)
-        levels.append(rows)
-        width = 2
-    return jnp.concatenate(levels, axis=-1)
+    levels = [rows.reshape(*rows.shape[:-1], -1, size) for size in SIZES[1:]]
+    return jnp.concatenate([jnp.sum(level, axis=-1) for level in levels], axis=-1)
 
 
 class Clusters(eqx.Module):
@@ -178,24 +184,19 @@ class Clusters(eqx.Module):
 
     @classmethod
     def of(cls, centers: Float[Array, "3 splats"], weights: Float[Array, " splats"]) -> "Clusters":
-        """Merge splats to the first clusters, and those of each level to the next."""
-        levels = [cls(weights, centers, jnp.zeros((len(_AXES), len(weights)), weights.dtype))]
-        for width in (SIZES[1], *[2] * (len(SIZES) - 2)):
-            levels.append(levels[-1]._merged(width))
-        return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), *levels[1:])
+        """Merge the splats."""
 
-    def _merged(self, width: int) -> "Clusters":
-        """Merge runs of `width` clusters."""
-        weights, centers, moments = jax.tree.map(
-            lambda leaf: leaf.reshape(*leaf.shape[:-1], -1, width),
-            (self.totals, self.centers, self.moments),
-        )
-        totals = jnp.sum(weights, axis=-1)
-        shares = weights / jnp.where(totals > 0, totals, 1.0)[:, None]
-        means = jnp.sum(shares[None] * centers, axis=-1)
-        offsets = centers - means[..., None]
-        products = jnp.stack([0.5 * offsets[i] * offsets[j] for i, j in _AXES])
-        return Clusters(totals, means, jnp.sum(shares[None] * (moments + products), axis=-1))
+        def of_level(size: int) -> Clusters:
+            x, of_splats = centers.reshape(3, -1, size), weights.reshape(-1, size)
+            totals = jnp.sum(of_splats, axis=-1)
+            shares = of_splats / jnp.where(totals > 0, totals, 1.0)[:, None]
+            means = jnp.sum(shares[None] * x, axis=-1)
+            offsets = x - means[..., None]
+            products = jnp.stack([0.5 * offsets[i] * offsets[j] for i, j in _AXES])
+            return cls(totals, means, jnp.sum(shares[None] * products, axis=-1))
+
+        levels = map(of_level, SIZES[1:])
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), *levels)
 
 
 def _boxes(centers, exists, size):

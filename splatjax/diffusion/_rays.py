@@ -13,7 +13,7 @@ from splatjax.scattering import ExactFresnel, Medium
 from splatjax.scene import Material
 
 from ._diffuser import Beams
-from ._surface_sums import GRAZING, ScreenedKernel, SurfaceSums, dot
+from ._surface_sums import GRAZING, ScreenedKernel, SurfaceSums, dot, integrate
 
 _DEPTHS = 6  # quadrature nodes along each beam
 _MILNE = 0.710446  # extrapolation distance of the Milne problem, mean free paths, times albedo
@@ -220,16 +220,12 @@ class SolvedLight(eqx.Module):
         direction = jnp.mean(directions, axis=0)
         light = SurfaceLight(fluence, flux, beams.irradiance, entering, direction)
         far, _, thickness = light.at_exits(surface, -normals)
-        rule = np.stack(np.polynomial.legendre.leggauss(_COSINES), axis=1)
 
-        def add(mean, node_and_weight):
-            cosine, weight = (node_and_weight[0] + 1) / 2, node_and_weight[1]
+        def towards(cosine):
             mu = _inside(jnp.full_like(thickness, cosine), material.eta)
-            seen = source_integral(light, far, mu, mu, thickness / mu, coefficients)
-            return mean + weight * cosine * seen, None
+            return 2 * cosine * source_integral(light, far, mu, mu, thickness / mu, coefficients)
 
-        start, rule = jnp.zeros_like(exitance), jnp.asarray(rule, exitance.dtype)
-        mean, _ = jax.lax.scan(jax.checkpoint(add), start, rule)
+        mean = integrate(towards, _COSINES, exitance)
         return cls(exitance, surface.slopes(exitance), light, mean)
 
 

@@ -21,7 +21,7 @@ from ._diffuser import (
     Diffused,
     LayerValues,
 )
-from ._hierarchy import Hierarchy, padded_count
+from ._hierarchy import Hierarchy, padded, padded_count
 from ._rays import DiffusionCoefficients, SolvedLight, radiance_towards, scattered_once
 from ._surface_sums import SOFTENED, ScreenedKernel, SurfaceSums
 
@@ -93,9 +93,8 @@ class ShapeDiffuser(AbstractDiffuser):
         - `bounced`: irradiance of uniform light that enters beside the beams.
         """
         surface = SurfaceSums.of(splats, hierarchy)
-        return self.exitance_on_surface(surface, medium, *surface.padded((beams, bounced)))[
-            :, : splats.count
-        ]
+        exitance = self.exitance_on_surface(surface, medium, *padded((beams, bounced)))
+        return exitance[:, : splats.count]
 
     def exitance_on_surface(self, surface: SurfaceSums, medium, beams, bounced):
         """Compute `radiant_exitance` of padded splats."""
@@ -203,9 +202,9 @@ class ShapePlan(AbstractDiffusionPlan):
 
     def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
         surface = SurfaceSums.of(splats, self.hierarchy)
-        padded = surface.padded((beams(), bounced))
-        exitance = self.diffuser.exitance_on_surface(surface, material.medium, *padded)
-        solved = SolvedLight.of(surface, material, exitance, *padded)
+        light = padded((beams(), bounced))
+        exitance = self.diffuser.exitance_on_surface(surface, material.medium, *light)
+        solved = SolvedLight.of(surface, material, exitance, *light)
         at = jnp.arange(splats.count) if at is None else at
         layers = LayerValues(*(take_points(row[None], at) for row in (exitance, solved.slopes)))
         return Diffused(layers, jnp.zeros_like(exitance[0, 0])), solved

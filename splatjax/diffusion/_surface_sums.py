@@ -3,16 +3,17 @@ the Green's function of the diffusion equation, softened within their spacing.
 """
 
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
 
-from ._hierarchy import Clusters, Hierarchy, cluster_totals, padded_count
+from ._hierarchy import Clusters, Hierarchy, cluster_totals, padded
 
 GRAZING = 1e-3  # cosine
 _OVERLAP = 1.5  # radius of a splat over the root of its area
@@ -93,27 +94,31 @@ class ScreenedKernel(eqx.Module):
 
         - `height`: of the point over the plane, mm.
         """
-        rule = np.stack(np.polynomial.legendre.leggauss(_NODES), axis=1)
         kappa = self.kappa.reshape(-1, *[1] * (height.ndim - 1))
         end = _REACH * self.length
         span = jnp.maximum(end - jnp.abs(height), 0)
 
-        def add(total, node_and_weight):
-            node, weight = node_and_weight
-            r = end - span * (1 - node) / 2
+        def removed(fraction):
+            r = end - span * (1 - fraction)
             inverse, _ = self._softening(r * r)
-            left_out = jnp.exp(-kappa * r) - r * inverse * jnp.exp(-kappa / inverse)
-            return total + weight / 4 * span * left_out, None
+            return jnp.exp(-kappa * r) - r * inverse * jnp.exp(-kappa / inverse)
 
-        start, rule = jnp.zeros_like(height), jnp.asarray(rule, height.dtype)
-        return jax.lax.scan(jax.checkpoint(add), start, rule)[0]
+        return 0.5 * span * integrate(removed, _NODES, height)
 
 
-def _padded(rows: PyTree[Array], count: int) -> PyTree[Array]:
-    """Append zeros along the last axis, up to a number of entries."""
-    return jax.tree.map(
-        lambda row: jnp.pad(row, [(0, 0)] * (row.ndim - 1) + [(0, count - row.shape[-1])]), rows
-    )
+def integrate(
+    function: Callable[[Array], Float[Array, "*shape"]], nodes: int, like: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """Integrate a function from 0 to 1 by Gauss and Legendre's rule, one node after the other; its
+    values have the shape of `like`.
+    """
+    x, weights = np.polynomial.legendre.leggauss(nodes)
+    rule = jnp.asarray(np.stack([(1 + x) / 2, weights / 2], axis=1), like.dtype)
+
+    def add(total, node_and_weight):
+        return total + node_and_weight[1] * function(node_and_weight[0]), None
+
+    return jax.lax.scan(jax.checkpoint(add), jnp.zeros_like(like), rule)[0]
 
 
 class SurfaceSums(eqx.Module):
@@ -138,12 +143,8 @@ class SurfaceSums(eqx.Module):
                 "weights=None, or render with ClusterDiffuser"
             )
         rows = splats.centers.T, splats.normals.T, splats.areas
-        centers, normals, areas = _padded(rows, padded_count(splats.count))
+        centers, normals, areas = padded(rows)
         return cls(hierarchy, centers, normals, areas, Clusters.of(centers, areas))
-
-    def padded(self, rows: PyTree[Array]) -> PyTree[Array]:
-        """Append zeros to rows along the splats, for the padding."""
-        return _padded(rows, len(self.areas))
 
     def layers(
         self,
