@@ -7,7 +7,6 @@ of its list. The unit of length is the layer's standard deviation times the root
 """
 
 import functools
-import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -129,6 +128,8 @@ class _Sweep(eqx.Module):
     **Attributes:**
 
     - `kernels`: of each layer.
+    - `lists`: without rows where no point is a target.
+    - `order`: the lists, longest first.
     - `ranks`: the index of each point among the targets, in any order; for other points, distinct
       numbers from `count` on.
     - `count`: the number of targets. Static.
@@ -136,6 +137,7 @@ class _Sweep(eqx.Module):
 
     kernels: TruncatedGaussian
     lists: Lists
+    order: Int[Array, " lists"]
     ranks: Int[Array, "points_blocks block"]
     count: int = eqx.field(static=True)
 
@@ -148,18 +150,21 @@ class _Sweep(eqx.Module):
         shape: tuple[int, int],
     ) -> "_Sweep":
         """Choose the points `at` of all points, in blocks of a shape."""
-        count = math.prod(shape)
-        every = jnp.arange(count, dtype=jnp.int32)
-        if at is None:
-            return cls(kernels, lists, every.reshape(shape), count)
-        ranks = (every + len(at)).at[at].set(every[: len(at)], mode="drop").reshape(shape)
-        return cls(kernels, lists.only(jnp.any(ranks < len(at), axis=1)), ranks, len(at))
+        count, counts = shape[0] * shape[1], lists.counts
+        ranks = jnp.arange(count, dtype=jnp.int32)
+        if at is not None:
+            count = len(at)
+            ranks = (ranks + count).at[at].set(ranks[:count], mode="drop")
+            is_target = jnp.any(ranks.reshape(shape) < count, axis=1)
+            counts = jnp.where(is_target, counts.reshape(-1, len(is_target)), 0).reshape(-1)
+        lists, order = Lists(lists.rows, lists.first, counts), jnp.argsort(-counts)
+        return cls(kernels, lists, order.astype(jnp.int32), ranks.reshape(shape), count)
 
     def sweep(self, sweep: Callable, points: Float[Array, "lists 3 block"], out):
         """Apply `sweep(lanes, out)` to all lists with a row, `LANES` of them at a time."""
-        lists, count = self.lists, len(self.lists.order)
+        lists, count = self.lists, len(self.order)
         lanes = min(LANES, count)
-        order = jnp.append(lists.order, jnp.arange(count, count + -count % lanes, dtype=jnp.int32))
+        order = jnp.append(self.order, jnp.arange(count, count + -count % lanes, dtype=jnp.int32))
         sweeps = (jnp.sum(lists.counts > 0) + lanes - 1) // lanes
 
         def step(i, out):

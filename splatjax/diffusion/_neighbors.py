@@ -1,6 +1,4 @@
-"""Lists of the blocks of sources near each block of points: the search, once
-a geometry.
-"""
+"""Search for the blocks of sources near each block of points, once for a geometry."""
 
 import math
 from collections.abc import Sequence
@@ -33,20 +31,11 @@ class Lists(eqx.Module):
     - `rows`: indices of source blocks, in rows of fixed length; padding is the number of blocks,
       the index of an empty block. The last row is all padding.
     - `first`, `counts`: first row and number of rows of each list, per layer and block of points.
-    - `order`: the lists, longest first.
     """
 
     rows: Int[Array, "rows width"]
     first: Int[Array, " lists"]
     counts: Int[Array, " lists"]
-    order: Int[Array, " lists"]
-
-    def only(self, chosen: Bool[Array, " points_blocks"]) -> "Lists":
-        """Remove all other blocks of points."""
-        counts = jnp.where(chosen, self.counts.reshape(-1, len(chosen)), 0).reshape(-1)
-        # A stable sort: those without a row come last.
-        order = self.order[jnp.argsort(counts[self.order] == 0)]
-        return Lists(self.rows, self.first, counts, order)
 
 
 class Boxes(eqx.Module):
@@ -139,16 +128,14 @@ def find_neighbors(
             pairs = pool.map(partial(search, part), range(len(reaches)))
             targets, near = (np.concatenate(column) for column in zip(*pairs, strict=True))
             rows, counts = in_rows(targets, near, lists, BLOCKS_PER_ROW, len(low))
-            order = np.argsort(-counts, kind="stable")
-            tables.append((rows, np.cumsum(counts) - counts, counts, order))
+            tables.append((rows, np.cumsum(counts) - counts, counts))
+    rows, first, counts = zip(*tables, strict=True)
     # At least one row, the last, stays empty: lanes whose list has ended read it.
-    most = max(len(rows) for rows, *_ in tables)
-    count = max(_ROWS * lists, with_spare(("rows", lists), most, 1, per_octave=2))
-    padded = [
-        (np.pad(rows, ((0, count - len(rows)), (0, 0)), constant_values=len(low)), *columns)
-        for rows, *columns in tables
+    count = max(_ROWS * lists, with_spare(("rows", lists), max(map(len, rows)), 1, per_octave=2))
+    rows = [
+        np.pad(part, ((0, count - len(part)), (0, 0)), constant_values=len(low)) for part in rows
     ]
-    joined = (np.concatenate(column) for column in zip(*padded, strict=True))
+    joined = (np.concatenate(table) for table in (rows, first, counts))
     return Lists(*(jnp.asarray(table, jnp.int32) for table in joined))
 
 
