@@ -62,9 +62,11 @@ class LayerSources(eqx.Module):
         - `edges`: of the cells of each layer, mm; 0 for single splats, inf for none.
         """
         cells = sorted({edge for edge in edges if 0 < edge < np.inf})
-        nested = dict(zip(cells, nested_cells(centers, normals, exists, cells), strict=True))
-        nested[0.0] = np.arange(len(exists), dtype=np.int32), len(exists)
-        nested[np.inf] = np.full(len(exists), np.iinfo(np.int32).max // 2, np.int32), 0
+        nested = {
+            0.0: (np.arange(len(exists)), len(exists)),
+            np.inf: (np.full(len(exists), np.iinfo(np.int32).max // 2), 0),
+            **dict(zip(cells, nested_cells(centers, normals, exists, cells), strict=True)),
+        }
         cells_of_splats, counts = zip(*(nested[edge] for edge in edges), strict=True)
         blocks = -(-np.asarray(counts) // SOURCES_PER_BLOCK)
         layers, ends = np.repeat(np.arange(len(edges)), blocks), np.cumsum(blocks)
@@ -176,26 +178,24 @@ def compact_order(points: np.ndarray) -> np.ndarray:
     todo = [(0, len(points))]
     while todo:
         begin, end = todo.pop()
-        step = _TOGETHER if end - begin > _TOGETHER else POINTS_PER_BLOCK
-        if end - begin <= step or end - begin == _TOGETHER:
-            continue
-        middle = begin + -(-(end - begin) // (2 * step)) * step
-        part = coordinates[:, begin:end]
-        turn = np.argpartition(part[np.argmax(np.ptp(part, axis=1))], middle - begin - 1)
-        order[begin:end], coordinates[:, begin:end] = order[begin:end][turn], part[:, turn]
-        todo += [(begin, middle), (middle, end)]
-    together, in_blocks = (len(points) // size * size for size in (_TOGETHER, POINTS_PER_BLOCK))
-    for begin in range(0, together, _TOGETHER):
-        part = slice(begin, begin + _TOGETHER)
-        _halve(order[part], coordinates[:, part], _TOGETHER)
-    _halve(order[together:in_blocks], coordinates[:, together:in_blocks], POINTS_PER_BLOCK)
+        part, count = slice(begin, end), end - begin
+        if count in (_TOGETHER, POINTS_PER_BLOCK):
+            _halve(order[part], coordinates[:, part])
+        elif count > POINTS_PER_BLOCK:
+            step = _TOGETHER if count > _TOGETHER else POINTS_PER_BLOCK
+            middle = begin + -(-count // (2 * step)) * step
+            longest = np.argmax(np.ptp(coordinates[:, part], axis=1))
+            turn = np.argpartition(coordinates[longest, part], middle - begin - 1)
+            order[part], coordinates[:, part] = order[part][turn], coordinates[:, part][:, turn]
+            todo += [(begin, middle), (middle, end)]
     return order
 
 
-def _halve(order: np.ndarray, coordinates: np.ndarray, size: int) -> None:
-    """Split parts of one size in halves, along their longest axes, down to quarters of a block. In
+def _halve(order: np.ndarray, coordinates: np.ndarray) -> None:
+    """Split points in halves, along the longest axis of each part, down to quarters of a block. In
     place.
     """
+    size = len(order)
     while size > POINTS_PER_BLOCK // 4:
         parts = coordinates.reshape(3, -1, size)
         longest = np.argmax(np.ptp(parts, axis=2), axis=0)
