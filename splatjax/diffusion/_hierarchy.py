@@ -93,16 +93,21 @@ class Hierarchy(eqx.Module):
     near: Interactions
     far: Interactions
 
-    def sum(
+    def reduce(
         self,
         near: Callable,
         far: Callable,
         points: PyTree[Array],
         splats: PyTree[Array],
         clusters: PyTree[Array],
+        combine: Callable = jax.ops.segment_sum,
+        join: Callable = jnp.add,
     ) -> Float[Array, "results points"]:
-        """Sum `near` over near splats and `far` over clusters, as `Interactions.reduce`."""
-        return self.near.reduce(near, points, splats) + self.far.reduce(far, points, clusters)
+        """Combine `near` of near splats and `far` of clusters, as `Interactions.reduce`, and join
+        the results: sums by default.
+        """
+        of_splats = self.near.reduce(near, points, splats, combine)
+        return join(of_splats, self.far.reduce(far, points, clusters, combine))
 
     @classmethod
     def build(
@@ -142,9 +147,11 @@ class Hierarchy(eqx.Module):
             if level:
                 targets = np.repeat(targets, 2)
                 sources = (2 * sources[:, None] + np.arange(2)).reshape(-1)
-        near = Interactions.of(targets, sources, len(low_x), SOURCES_PER_BLOCK)
         pairs = (np.concatenate(levels) for levels in zip(*far, strict=True))
-        return cls(near, Interactions.of(*pairs, len(low_x), 1))
+        return cls(
+            near=Interactions.of(targets, sources, len(low_x), SOURCES_PER_BLOCK),
+            far=Interactions.of(*pairs, len(low_x), 1),
+        )
 
 
 def padded_count(count: int) -> int:

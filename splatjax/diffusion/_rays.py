@@ -62,10 +62,10 @@ class DiffusionCoefficients(eqx.Module):
         loss = medium.sigma_a / sigma_t
         diffusion = (1 + loss * (0.45 + 0.5 * loss)) / (3 - 1.05 * loss) / sigma_t
         inward = 4 / (1 - fresnel.first_moment(medium.eta))
-        z_e = _MILNE / 4 * (1 + fresnel.second_moment(medium.eta)) * inward / sigma_t
+        z_e = _MILNE / 4 * (1 + fresnel.second_moment(medium.eta)) * inward
+        z_e = z_e / (sigma_t * jnp.maximum(albedo, _LEAST_ALBEDO))
         # A half-space that absorbs returns of even light what Chandrasekhar's H gives.
         inward = inward * (1 + 4.5 * loss) / (1 + 4.95 * loss)
-        z_e = z_e / jnp.maximum(albedo, _LEAST_ALBEDO)
         lasting = 1 - loss * (0.53 + 0.265 * loss)
         return cls(sigma_t, albedo, diffusion, medium.sigma_a / diffusion, z_e, lasting, inward)
 
@@ -100,8 +100,7 @@ def scattered_once(
             length, cosine, rows = surface.first_exits(directions, irradiance > 0, rows)
             return rows[0], (length, cosine, dot(rows[1:], normals))
 
-        none = jnp.zeros_like(irradiance)
-        _, to_exits, ends = jax.vjp(exits, none, has_aux=True)
+        _, to_exits, ends = jax.vjp(exits, jnp.zeros_like(irradiance), has_aux=True)
         length, exit_cosine, alike = (row[None] for row in ends)
         is_through = jnp.isfinite(length)
         length = jnp.where(is_through, length, 0.0)
@@ -217,8 +216,9 @@ class SolvedLight(eqx.Module):
             balance = coefficients.diffusion_coefficient / coefficients.z_e * coefficients.inward
             fluence, flux = fluence + (balance - 1)[:, None] * bounced, flux - bounced
         entering = jnp.maximum(-jnp.sum(directions * normals[None], axis=1), 0)
-        direction = jnp.mean(directions, axis=0)
-        light = SurfaceLight(fluence, flux, beams.irradiance, entering, direction)
+        light = SurfaceLight(
+            fluence, flux, beams.irradiance, entering, direction=jnp.mean(directions, axis=0)
+        )
         far, _, thickness = light.at_exits(surface, -normals)
 
         def towards(cosine):

@@ -72,8 +72,9 @@ class ShapeDiffuser(AbstractDiffuser):
 
     def __check_init__(self):
         check_values("ShapeDiffuser.error", self.error, "positive", lambda x: x > 0)
-        between = "between 0 and 1", lambda x: (x >= 0) & (x <= 1)
-        check_values("ShapeDiffuser.opening", self.opening, *between)
+        check_values(
+            "ShapeDiffuser.opening", self.opening, "between 0 and 1", lambda x: (x >= 0) & (x <= 1)
+        )
 
     def radiant_exitance(
         self,
@@ -197,8 +198,7 @@ class ShapePlan(AbstractDiffusionPlan):
                 f"Material.medium is {material.medium}, and ShapeDiffuser needs a Medium of "
                 f"{material.channels} channels; give one, or render with ClusterDiffuser"
             )
-        surface = material.surface_of(material.gaussians)
-        return dataclasses.replace(surface, medium=material.medium)
+        return dataclasses.replace(material.surface_of(material.gaussians), medium=material.medium)
 
     def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
         surface = SurfaceSums.of(splats, self.hierarchy)
@@ -214,8 +214,8 @@ class ShapePlan(AbstractDiffusionPlan):
         their radiance towards the eye.
         """
         surface = SurfaceSums.of(splats, self.hierarchy)
-        seen = take_points(radiance_towards(eye, surface, material, solved), at)
-        return LayerValues(seen[None], layers.slopes)
+        seen = radiance_towards(eye, surface, material, solved)
+        return LayerValues(take_points(seen, at)[None], layers.slopes)
 
     def diffuse(self, sources, variances, kernel, combination, at=None):
         raise ValueError(

@@ -142,8 +142,7 @@ class SurfaceSums(eqx.Module):
                 "splats.weights has factors on Gaussians, which ShapeDiffuser does not read; give "
                 "weights=None, or render with ClusterDiffuser"
             )
-        rows = splats.centers.T, splats.normals.T, splats.areas
-        centers, normals, areas = padded(rows)
+        centers, normals, areas = padded((splats.centers.T, splats.normals.T, splats.areas))
         return cls(hierarchy, centers, normals, areas, Clusters.of(centers, areas))
 
     def layers(
@@ -190,7 +189,7 @@ class SurfaceSums(eqx.Module):
         )
         dipoles = cluster_totals(about_origin) - totals[:, None] * centers[None]
         inputs = (powers, facing, self.centers), (totals, dipoles, centers, moments)
-        return self.hierarchy.sum(near, far, self.centers, *inputs)
+        return self.hierarchy.reduce(near, far, self.centers, *inputs)
 
     def potential(
         self,
@@ -220,7 +219,7 @@ class SurfaceSums(eqx.Module):
             return [jnp.sum(clusters.totals * (value + along * twice), axis=1)]
 
         merged = Clusters.of(places, charges)
-        return self.hierarchy.sum(near, far, self.centers, (charges, places), merged)[0]
+        return self.hierarchy.reduce(near, far, self.centers, (charges, places), merged)[0]
 
     def first_exits(
         self,
@@ -265,14 +264,12 @@ class SurfaceSums(eqx.Module):
         facing, total = self.areas[None] * self.normals, self.clusters.totals
         discs = (self.centers, facing), (self.clusters.centers, cluster_totals(facing))
         means = cluster_totals(self.areas[None] * rows) / jnp.where(total > 0, total, 1.0)[None]
-        rays, (near, far) = (self.centers, directions), (self.hierarchy.near, self.hierarchy.far)
-        starts_of = (
-            interactions.reduce(first, rays, sources, jax.ops.segment_min)
-            for interactions, sources in zip((near, far), discs, strict=True)
+        rays = self.centers, directions
+        (start,) = jax.lax.stop_gradient(
+            self.hierarchy.reduce(first, first, rays, *discs, jax.ops.segment_min, jnp.minimum)
         )
-        (start,) = jax.lax.stop_gradient(jnp.minimum(*starts_of))
         sources = zip(discs, (rows, means), strict=True)
-        sums = self.hierarchy.sum(blend, blend, (*rays, start), *sources)
+        sums = self.hierarchy.reduce(blend, blend, (*rays, start), *sources)
         is_hit = starts & (sums[0] > 0)
         means = sums[1:] / jnp.where(is_hit, sums[0], 1.0)[None]
         length = jnp.where(is_hit, means[0], jnp.where(starts, jnp.inf, 0.0))
