@@ -60,10 +60,9 @@ def map_chunks(function: Callable[..., Result], *arrays: PyTree, at_once: int = 
     results = jax.lax.map(
         jax.checkpoint(compute), jax.tree.map(split, jax.tree.map(_planes, arrays))
     )
-    joined = jax.tree.map(
-        lambda leaf: leaf.reshape(chunks * size, *leaf.shape[2:])[:length], results
+    return _vectors(
+        jax.tree.map(lambda leaf: leaf.reshape(chunks * size, *leaf.shape[2:])[:length], results)
     )
-    return _vectors(joined)
 
 
 _LONGEST = 4  # of the vectors that are kept as planes

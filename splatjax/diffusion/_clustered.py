@@ -212,8 +212,8 @@ def layer_sums(
     light = below.areas[None] * jnp.pad(below.irradiance, ((0, 1), (0, 0)), constant_values=1)
     rows = light.reshape(len(light), -1, SOURCES_PER_BLOCK)
     table = SourceTable(tuple(centers), tuple(rows), moments)
-    in_units = per_mm[:, None, None, None] * points[None]
-    return gaussian_sums(in_units, table, lists, kernels, at, forward_mode)
+    points = per_mm[:, None, None, None] * points[None]
+    return gaussian_sums(points, table, lists, kernels, at, forward_mode)
 
 
 def per_flat_mass(
@@ -248,8 +248,8 @@ def _enclose(
     centers = splats.centers - jnp.mean(splats.centers, axis=1)[:, None]
     depths = kernel.depths(variances)
     below = clusters.merged(dataclasses.replace(splats, centers=centers), depths)
-    boxes = _target_boxes(centers, splats.areas), source_boxes(below)
-    return *boxes, kernel.depths(variances * margin) - depths
+    sinking = kernel.depths(variances * margin) - depths
+    return _target_boxes(centers, splats.areas), source_boxes(below), sinking
 
 
 @eqx.filter_jit

@@ -1,7 +1,5 @@
 """The radiant exitance of the splats in place of their layers: fewer rows to blend."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -13,6 +11,7 @@ from ._clustered import ClusterDiffuser
 from ._diffuser import (
     AbstractDiffuser,
     AbstractDiffusionPlan,
+    Diffused,
     LayerValues,
     Sources,
 )
@@ -45,8 +44,7 @@ class ExitanceDiffuser(AbstractDiffuser):
             )
 
     def make_plan(self, parts, variances, kernel, interval):
-        layers = self.layers.make_plan(parts, variances, kernel, interval)
-        return ExitancePlan.of(layers, interval)
+        return ExitancePlan.of(self.layers.make_plan(parts, variances, kernel, interval), interval)
 
 
 class ExitancePlan(AbstractDiffusionPlan):
@@ -103,8 +101,7 @@ class ExitancePlan(AbstractDiffusionPlan):
             total = offset + jnp.sum(of_means * means, axis=0)
             return LayerValues(total[None], jnp.sum(of_means[:, :, None] * slopes, axis=0)[None])
 
-        layers = exitance(diffused.layers, *along_splats)
-        return dataclasses.replace(diffused, layers=layers), None
+        return Diffused(exitance(diffused.layers, *along_splats), diffused.needed), None
 
     def diffuse(self, sources, variances, kernel, combination, at=None):
         raise ValueError(

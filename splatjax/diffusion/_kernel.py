@@ -207,8 +207,7 @@ class EscapeNormalization(AbstractDiffusionKernel):
         absorbed = jnp.where(leaves <= 1 + _SLACK, 1 - leaves, 0.0)
 
         # The decay rate in units of the layer's width, kappa sqrt(v), and its square.
-        lacking = energies.ndim - variances.ndim
-        variance = variances.reshape(*variances.shape, *[1] * lacking)
+        variance = variances.reshape(*variances.shape, *[1] * (energies.ndim - variances.ndim))
         mean_variance = jnp.sum(energies * variance, axis=0) / jnp.maximum(leaves, _TINY_ENERGY)
         squared_rate = absorbed / jnp.where(mean_variance > 0, mean_variance, 1.0)
         squared = squared_rate[None] * variance
@@ -217,11 +216,10 @@ class EscapeNormalization(AbstractDiffusionKernel):
         # The curvature in the same unit, by the greatest mass of all layers not wider. Not by
         # `jnp.max`: its derivative asks whether recomputed floats are equal.
         greatest = jnp.ones_like(variance * mass)
-        each = [1] * len(mass)
-        layers = zip(jax.lax.split(variance, each), jax.lax.split(mass, each), strict=True)
-        for its_variance, its_mass in layers:
-            counts = (its_variance <= variance) & (its_mass > greatest)
-            greatest = jnp.where(counts, its_mass, greatest)
+        layers = (jax.lax.split(rows, [1] * len(mass)) for rows in (variance, mass))
+        for layer_variance, layer_mass in zip(*layers, strict=True):
+            counts = (layer_variance <= variance) & (layer_mass > greatest)
+            greatest = jnp.where(counts, layer_mass, greatest)
         excess = greatest - 1
         excess = excess * excess / (excess + _ROUNDING)
         curvature = excess / (1 + excess) / max(self.depth, _SHALLOW)

@@ -27,9 +27,8 @@ def _along_slopes(
     layers: LayerValues, offsets: Float[Array, "3 points"]
 ) -> Float[Array, "*layers values points"]:
     # Written out, so that XLA fuses it into its readers: a third of the time of a reduction.
-    slopes, above = layers.slopes, range(layers.slopes.ndim - 2)
-    along = slopes * jnp.expand_dims(offsets, tuple(above))
-    x, y, z = jax.lax.split(along, (1, 1, 1), axis=slopes.ndim - 2)
+    along = layers.slopes * jnp.expand_dims(offsets, tuple(range(layers.slopes.ndim - 2)))
+    x, y, z = jax.lax.split(along, (1, 1, 1), axis=-2)
     return (x + y + z)[..., 0, :]
 
 
