@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -243,7 +243,7 @@ class AbstractDiffuser(eqx.Module):
         """
 
 
-def _light_and_mass(rows: Float[Array, "..."], axis: int) -> list[Float[Array, "..."]]:
+def _light_and_mass(rows: Float[Array, "..."], axis: int) -> Sequence[Float[Array, "..."]]:
     """Separate the channels from the mass. The derivative of slices would be a sum."""
     return jax.lax.split(rows, (rows.shape[axis] - 1, 1), axis=axis)
 

@@ -100,14 +100,17 @@ class Hierarchy(eqx.Module):
         points: PyTree[Array],
         splats: PyTree[Array],
         clusters: PyTree[Array],
+        *,
         combine: Callable = jax.ops.segment_sum,
         join: Callable = jnp.add,
     ) -> Float[Array, "results points"]:
         """Combine `near` of near splats and `far` of clusters, as `Interactions.reduce`, and join
         the results: sums by default.
         """
-        of_splats = self.near.reduce(near, points, splats, combine)
-        return join(of_splats, self.far.reduce(far, points, clusters, combine))
+        return join(
+            self.near.reduce(near, points, splats, combine),
+            self.far.reduce(far, points, clusters, combine),
+        )
 
     @classmethod
     def build(

@@ -265,9 +265,10 @@ class SurfaceSums(eqx.Module):
         discs = (self.centers, facing), (self.clusters.centers, cluster_totals(facing))
         means = cluster_totals(self.areas[None] * rows) / jnp.where(total > 0, total, 1.0)[None]
         rays = self.centers, directions
-        (start,) = jax.lax.stop_gradient(
-            self.hierarchy.reduce(first, first, rays, *discs, jax.ops.segment_min, jnp.minimum)
+        starts_of = self.hierarchy.reduce(
+            first, first, rays, *discs, combine=jax.ops.segment_min, join=jnp.minimum
         )
+        (start,) = jax.lax.stop_gradient(starts_of)
         sources = zip(discs, (rows, means), strict=True)
         sums = self.hierarchy.reduce(blend, blend, (*rays, start), *sources)
         is_hit = starts & (sums[0] > 0)
