@@ -148,10 +148,10 @@ class ShapeDiffuser(AbstractDiffuser):
             raise ValueError(
                 f"the areas of {len(areas)} splats sum to {area}; ShapeDiffuser needs a closed body"
             )
-        opening = np.linalg.norm(areas @ normals) / area
-        if opening > _OPEN:
+        open_part = np.linalg.norm(areas @ normals) / area
+        if open_part > _OPEN:
             raise ValueError(
-                f"the normals of the splats, weighted by area, sum to {opening:.2g} of the "
+                f"the normals of the splats, weighted by area, sum to {open_part:.2g} of the "
                 "area instead of 0, so the body is open; close the mesh for ShapeDiffuser, or "
                 "render with ClusterDiffuser"
             )
