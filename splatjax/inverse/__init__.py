@@ -2,11 +2,8 @@
 albedo, lights, cameras and shape.
 """
 
-from ._draws import randomized_fits as randomized_fits
-from ._fit_scene import (
-    fit_scene as fit_scene,
-    FittedScene as FittedScene,
-)
+from ._fit_scene import fit_scene as fit_scene
+from ._fitted_scene import FittedScene as FittedScene, randomized_fits as randomized_fits
 from ._observation import (
     AbstractBackground as AbstractBackground,
     BlackBackground as BlackBackground,
@@ -23,8 +20,6 @@ from ._observation import (
     Observation as Observation,
     PicturedScene as PicturedScene,
 )
-from ._offsets import NormalOffsets as NormalOffsets
-from ._parameter_map import ParameterMap as ParameterMap
 from ._parts import (
     AbstractPart as AbstractPart,
     AlbedoMap as AlbedoMap,
@@ -39,3 +34,4 @@ from ._recover import (
     recover as recover,
 )
 from ._recovery import combined as combined, Estimate as Estimate, Recovery as Recovery
+from ._surface_maps import NormalOffsets as NormalOffsets, ParameterMap as ParameterMap

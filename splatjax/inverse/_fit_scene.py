@@ -13,9 +13,9 @@ from jaxtyping import Array, Float, PyTree
 from splatjax._precision import full_precision
 from splatjax._records import as_floats
 from splatjax.render import Plan, RenderSettings, render
-from splatjax.scene import AbstractLight, Camera, Material, Splats
+from splatjax.scene import Material, Splats
 
-from ._movable_scene import Coordinates, FitState, MovableScene
+from ._fitted_scene import FitState, FittedScene
 from ._observation import (
     AbstractBackground,
     AbstractLoss,
@@ -29,7 +29,7 @@ from ._observation import (
     check_counted,
     compared,
 )
-from ._parts import AbstractPart
+from ._parts import AbstractPart, Coordinates, MovableScene
 from ._problem import make_plans
 
 
@@ -98,47 +98,6 @@ def advance(
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         updates, state = optimizer.update(gradient, state, x)
     return jax.tree.map(jnp.add, x, updates), state, loss, jnp.all(finite)
-
-
-class FittedScene(eqx.Module):
-    r"""The best scene of a fit.
-
-    **Attributes:**
-
-    - `splats`: the body.
-    - `cameras`, `lights`: cameras and lights of each picture; `material`: the given material.
-    - `maps`: the values of each parameter of a `ParameterMap`, by name.
-    - `losses`: loss at the start and after each step: the sum over all pixels and priors, divided
-      by the number of values that count. About 1 if the residual is noise.
-    - `best`: the step with the least loss, to which the other fields belong. Static.
-    - `plans`: number of plans, including the first. Static.
-    - `pictures`: the rendered pictures; NaN where a pixel does not count.
-    - `residuals`: rendered minus observed pictures.
-    - `result`: the outcome, as a message (`optimistix.RESULTS`).
-    - `coordinates`, `state`: coordinates and state from which another fit can `start`.
-    """
-
-    splats: Splats
-    cameras: tuple[Camera, ...]
-    lights: tuple[tuple[AbstractLight, ...], ...]
-    material: Material
-    maps: dict[str, Float[Array, " splats"]]
-    losses: Float[np.ndarray, " steps"]
-    pictures: tuple[Float[np.ndarray, "_ _ channels"], ...]
-    residuals: tuple[Float[np.ndarray, "_ _ channels"], ...]
-    result: optx.RESULTS
-    coordinates: Coordinates
-    state: FitState
-    best: int = eqx.field(static=True)
-    plans: int = eqx.field(static=True)
-
-    def restarted(self, expected: list[Array] | None = None) -> "FittedScene":
-        """Return the start of a new fit from the best step, with any optimizer; `expected` replaces
-        the means of the residuals of the priors.
-        """
-        expected = self.state.expected if expected is None else expected
-        state = FitState(self.coordinates, None, self.state.plans, expected)
-        return eqx.tree_at(lambda f: (f.state, f.losses), self, (state, np.zeros(0)))
 
 
 def fit_scene(

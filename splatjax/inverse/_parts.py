@@ -1,7 +1,10 @@
-"""Parts of a scene that may move, each in unbounded coordinates: albedo, lights and cameras."""
+"""Parts of a scene that may move, each in unbounded coordinates: albedo, lights and cameras; and
+the scene with all its movable parts.
+"""
 
 import abc
 import dataclasses
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -17,6 +20,9 @@ from ._observation import PicturedScene
 # Bounded quantities start at least this far from 0 and 1, where their logits are infinite.
 BOUNDED = 1e-3
 _PLACES = ("direction", "position", "origin")  # fields of lights
+
+# Coordinates of each part; a tuple with one entry per picture if pictures do not share the part.
+Coordinates = tuple[PyTree[Array], ...]
 
 
 class AbstractPart(eqx.Module):
@@ -211,3 +217,64 @@ def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     squared, identity = vector @ vector, jnp.eye(3, dtype=vector.dtype)
     cross = jnp.cross(identity, vector[None])
     return identity + sinc(squared) * cross + 0.5 * sinc(squared / 4) ** 2 * (cross @ cross)
+
+
+class MovableScene(eqx.Module):
+    """The material, and the parts of the scene that may move."""
+
+    material: Material
+    parts: tuple[AbstractPart, ...]
+    prepared: tuple[PyTree[Array], ...]
+
+    @classmethod
+    def of(
+        cls, splats: Splats, material: Material, parts: Sequence[AbstractPart]
+    ) -> "MovableScene":
+        return cls(material, tuple(parts), tuple(part.prepared(splats) for part in parts))
+
+    def start(self, pictured_scenes: Sequence[PicturedScene]) -> Coordinates:
+        """Return the coordinates of the start: zeros."""
+        return tuple(
+            part.coordinates(pictured_scenes[0])
+            if part.shared
+            else tuple(part.coordinates(pictured) for pictured in pictured_scenes)
+            for part in self.parts
+        )
+
+    def of_picture(self, x: Coordinates, number: int) -> Coordinates:
+        """Select the coordinates that a picture depends on."""
+        return tuple(
+            coordinates if part.shared else coordinates[number]
+            for part, coordinates in zip(self.parts, x, strict=True)
+        )
+
+    def of_all(self, pictures: Sequence[Coordinates]) -> Coordinates:
+        """Combine the derivatives of all pictures: add the derivatives of shared parts."""
+        return tuple(
+            jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *derivatives)
+            if part.shared
+            else derivatives
+            for part, derivatives in zip(self.parts, zip(*pictures, strict=True), strict=True)
+        )
+
+    def moved(self, pictured: PicturedScene, x: Coordinates) -> PicturedScene:
+        for part, coordinates, prepared in zip(self.parts, x, self.prepared, strict=True):
+            pictured = part.moved(pictured, coordinates, prepared)
+        return pictured
+
+    def prior_residuals(self, x: Coordinates) -> list[Array]:
+        """Divide the coordinates of all parts with a prior by their expected deviations."""
+        return jax.tree.leaves(
+            [
+                part.prior_residuals(group, prepared)
+                for part, coordinates, prepared in zip(self.parts, x, self.prepared, strict=True)
+                for group in ((coordinates,) if part.shared else coordinates)
+            ]
+        )
+
+    def maps(self, x: Coordinates) -> dict[str, Float[Array, " splats"]]:
+        """Compute the maps of parameters of the material, by name."""
+        maps = {}
+        for part, coordinates, prepared in zip(self.parts, x, self.prepared, strict=True):
+            maps |= part.maps(coordinates, prepared)
+        return maps
