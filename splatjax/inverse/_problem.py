@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, DTypeLike, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._precision import full_precision
 from splatjax.diffusion import resolved_fraction
@@ -214,7 +214,12 @@ class RecoveryProblem(eqx.Module):
             counted.append(observed.counted(picture.coverage.astype(dtype), background))
             is_lit = np.any(np.asarray(picture.pixel_radiance_per_exitance) > 0, axis=0)
             is_lit &= np.asarray(counted[-1]).reshape(-1)[np.asarray(picture.pixels)] > 0
-            kept.append(_as(dtype, picture.of_points(np.flatnonzero(is_lit))))
+            points = picture.of_points(np.flatnonzero(is_lit))
+            kept.append(
+                jax.tree.map(
+                    lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, points
+                )
+            )
         check_counted(counted)
         return cls(tuple(kept), tuple(counted), tuple(evidence), unknowns, fit, loss, model)
 
@@ -239,12 +244,6 @@ class RecoveryProblem(eqx.Module):
         together = zip(self.evidence, self.radiance(point), self.counted, strict=True)
         residuals = [observed.residuals(*rendered, self.loss) for observed, *rendered in together]
         return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in residuals])
-
-
-def _as(dtype: DTypeLike, picture: DiffusionBasis) -> DiffusionBasis:
-    return jax.tree.map(
-        lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, picture
-    )
 
 
 @full_precision
@@ -273,29 +272,22 @@ def search(
     return *best, jnp.asarray(end.stats["num_steps"]), converged
 
 
-class Solution(eqx.Module):
-    """The solution at a point, and its information.
-
-    **Attributes:**
-
-    - `information`: inverse of the covariance due to noise of the given deviations (Laplace, in the
-      Gauss-Newton approximation); the unknowns are followed, channel by channel, by the logarithms
-      of the widths below which layers are unresolved.
-    - `gaussians`, `radiance`: Gaussians and radiance at the point.
-    - `unresolved`: the fraction of the light of each channel in unresolved layers.
-    """
-
-    information: Float[Array, "all all"]
-    gaussians: SumOfGaussians
-    radiance: tuple[Float[Array, "_ _ channels"], ...]
-    unresolved: Float[Array, " channels"]
-
-
 @full_precision
 @eqx.filter_jit
-def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solution:
-    """Compute the pictures at a point, and the information about each unknown and the transition to
-    unresolved layers.
+def solution(
+    problem: RecoveryProblem, point: Float[Array, " unknowns"]
+) -> tuple[
+    Float[Array, "all all"],
+    Float[Array, " channels"],
+    SumOfGaussians,
+    tuple[Float[Array, "_ _ channels"], ...],
+]:
+    """Compute the information that the pictures give at a point: the inverse of the covariance due
+    to noise of the given deviations (Laplace, in the Gauss-Newton approximation). The unknowns are
+    followed, channel by channel, by the logarithms of the widths below which layers are unresolved.
+
+    Also return the fraction of the light of each channel in unresolved layers, and the Gaussians
+    and the radiance at the point.
     """
 
     def residuals(point, log_width):
@@ -318,4 +310,4 @@ def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solu
     resolved = resolved_fraction(light.variances[:, None], areas[None], light.interval)
     unresolved = 1 - jnp.mean(jnp.where(mass > 0, resolved, 0.0), axis=1)
     unresolved = unresolved @ gaussians.weights / gaussians.total_reflectance()
-    return Solution(jnp.einsum("pci,pcj->ij", slopes, slopes), gaussians, radiance, unresolved)
+    return jnp.einsum("pci,pcj->ij", slopes, slopes), unresolved, gaussians, radiance

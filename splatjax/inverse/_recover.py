@@ -160,21 +160,22 @@ def recover(
         before = point
         point, cost, steps_taken, converged = search(problem, before)
         steps += int(steps_taken)
-        reached, size = solution(problem, point), point.size
+        information, unresolved, gaussians, radiance = solution(problem, point)
+        size = point.size
         chi_squared = cost / max(problem.pixels * channels - size, 1)
-        covariance = inverse(np.asarray(reached.information, np.float64)[:size, :size])
+        covariance = inverse(np.asarray(information, np.float64)[:size, :size])
         scale = 1.0 if noise_is_known else float(chi_squared) ** 0.5
         deviations = scale * np.sqrt(np.diagonal(covariance))
         moved = np.abs(point - before)
         settled = bool(converged) and np.all(moved <= np.maximum(_SETTLED, 0.1 * deviations))
         if settled or best is None or float(chi_squared) <= float(best.chi_squared):
-            pictures, residuals = compared(reached.radiance, problem.counted, evidence)
+            pictures, residuals = compared(radiance, problem.counted, evidence)
             best = Recovery(
                 medium=unknowns.medium(point),
-                material=surface.surface_of(reached.gaussians, model.angles(medium)),
+                material=surface.surface_of(gaussians, model.angles(medium)),
                 intensities=unknowns.intensities(point),
-                information=reached.information,
-                unresolved=reached.unresolved,
+                information=information,
+                unresolved=unresolved,
                 chi_squared=chi_squared,
                 pictures=pictures,
                 residuals=residuals,
@@ -306,11 +307,11 @@ def next_pictures(
         problem = RecoveryProblem.of(
             [picture], [evidence], unknowns, fit, SquaredLoss(), recovery.model
         )
-        at_point = solution(problem, unknowns.start(medium))
-        radiance = np.asarray(at_point.radiance[0])[np.asarray(problem.counted[0]) > 0]
+        information, _, _, (radiance,) = solution(problem, unknowns.start(medium))
+        radiance = np.asarray(radiance)[np.asarray(problem.counted[0]) > 0]
         bright = float(np.sqrt(np.mean(radiance**2)))
         scale = max(noise * (bright or 1.0), np.finfo(float).tiny) ** -2
-        information = np.asarray(at_point.information, float) * scale
+        information = np.asarray(information, float) * scale
         added = _marginal(information, medium.channels, len(recovery.information))
         predictions.append(Prediction(candidate, recovery.covariance(added)))
     return sorted(predictions, key=lambda prediction: prediction.worst.deviation)

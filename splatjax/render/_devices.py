@@ -252,31 +252,23 @@ def map_over(
     **Raises:** `ValueError` if the batch is empty, or its arrays have different lengths.
     """
     arrays = jax.tree_util.tree_leaves_with_path(eqx.filter(batch, eqx.is_array))
-    single = [jax.tree_util.keystr(path) for path, leaf in arrays if leaf.ndim == 0]
-    if single:
-        raise ValueError(
-            f"{', '.join(single)} has no first axis, along which a batch is stacked; stack it, "
-            "or share it"
-        )
-    counts = sorted({leaf.shape[0] for _, leaf in arrays})
-    if len(counts) != 1 or counts[0] == 0:
+    shapes = {jax.tree_util.keystr(path): list(leaf.shape) for path, leaf in arrays}
+    lengths = {tuple(shape[:1]) for shape in shapes.values()}
+    if len(lengths) != 1 or lengths & {(), (0,)}:
         raise ValueError(
             "the arrays of a batch must have one length along their first axis, not zero; these "
-            f"have {counts}"
+            f"have the shapes {shapes}; stack them, or share those that have no such axis"
         )
-    return _map_over(mesh, function, shared, batch, counts[0])
+    return _map_over(mesh, function, shared, batch)
 
 
 @eqx.filter_jit
-def _map_over(mesh: Mesh, function: Callable, shared: PyTree, batch: PyTree, count: int) -> PyTree:
+def _map_over(mesh: Mesh, function: Callable, shared: PyTree, batch: PyTree) -> PyTree:
     devices = DeviceMesh.of(mesh)
-    lacking = -count % devices.count
+    count = len(jax.tree.leaves(eqx.filter(batch, eqx.is_array))[0])
+    places = np.arange(count + -count % devices.count)
     arrays, static = eqx.partition((shared, batch), eqx.is_array)
-    if lacking:
-        last = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf[-1:], (lacking, *leaf.shape[1:])), arrays[1]
-        )
-        arrays = arrays[0], jax.tree.map(lambda *leaves: jnp.concatenate(leaves), arrays[1], last)
+    arrays = arrays[0], jax.tree.map(lambda leaf: rows_or_last(leaf, places), arrays[1])
 
     def share(shared, batch):
         replicated = eqx.combine(shared, static[0])
@@ -290,7 +282,7 @@ def _map_over(mesh: Mesh, function: Callable, shared: PyTree, batch: PyTree, cou
         share, mesh=mesh, in_specs=specs, out_specs=devices.shares, check_vma=False
     )
     results = mapped(*lay_out(mesh, arrays, specs))
-    if not lacking:
+    if len(places) == count:
         return results
     replicated = lay_out(mesh, results, jax.tree.map(lambda _: PartitionSpec(), results))
     return jax.tree.map(lambda leaf: leaf[:count], replicated)

@@ -1,7 +1,7 @@
 """Statistics of all splats of a stream, computed before a picture is rendered."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import jax
@@ -12,33 +12,31 @@ from jaxtyping import Array, Float
 from splatjax import diffusion as _diffusion
 from splatjax.scene import Parts, Splats
 
-_CHANGED = "parts must return the same splats in the same order at each call"
-
 
 class ReplayableStream:
     """Parts that must be the same at each iteration, because an iteration uses results of the one
-    before.
+    before. After each part, the number of finished splats is reported.
     """
 
-    def __init__(self, parts: Parts):
-        self.parts, self.marks = parts, None
+    def __init__(self, parts: Parts, report: Callable[[str, int], None] | None):
+        self.parts, self.report, self.marks = parts, report, None
 
-    def __call__(self) -> Iterator[Splats]:
+    def __call__(self, task: str) -> Iterator[Splats]:
         """Iterate over all splats from the beginning.
 
         **Raises:** `ValueError` if a part, or the number of parts, differs from the first
         iteration.
         """
-        marks = []
-        for i, part in enumerate(self.parts()):
-            marks.append(np.asarray(_mark(part)))
-            expected = marks if self.marks is None else self.marks
-            if i == len(expected) or not np.array_equal(marks[i], expected[i], equal_nan=True):
-                raise ValueError(_CHANGED)
+        marks, done = [], 0
+        for part in self.parts():
+            marks.append(np.asarray(_mark(part)).tobytes())
             yield part
-        self.marks = marks if self.marks is None else self.marks
-        if len(marks) != len(self.marks):
-            raise ValueError(_CHANGED)
+            done += part.count
+            if self.report is not None:
+                self.report(task, done)
+        if self.marks not in (None, marks):
+            raise ValueError("parts must return the same splats in the same order at each call")
+        self.marks = marks
 
 
 @jax.jit

@@ -23,7 +23,6 @@ from splatjax.scene import (
     Material,
     Parts,
     Scene,
-    Splats,
     StackedLights,
     lights_by_kind,
     stack_lights,
@@ -92,24 +91,14 @@ def render_streamed(
             f"settings has a {type(rasterizer).__name__} and a {type(diffuser).__name__}; only a "
             "TileRasterizer and a ClusterDiffuser can be streamed"
         )
-    stream = ReplayableStream(parts)
-
-    def reported(task: str) -> Iterator[Splats]:
-        done = 0
-        for part in stream():
-            yield part
-            done += part.count
-            if report is not None:
-                report(task, done)
-
-    statistics = StreamStatistics.of(lambda: reported("looking"))
-
+    stream = ReplayableStream(parts, report)
+    statistics = StreamStatistics.of(lambda: stream("looking"))
     part_size = (
         -(-statistics.part_size // _diffusion.POINTS_PER_BLOCK) * _diffusion.POINTS_PER_BLOCK
     )
 
     def scenes(task: str) -> Iterator[Scene]:
-        for part in reported(task):
+        for part in stream(task):
             scene = Scene(pad_splats(part, part_size), tuple(lights), material)
             yield in_one_dtype(scene)[0]
 
@@ -152,7 +141,8 @@ def render_streamed(
     light = partial(_light, groups=groups, shadow_maps=shadow_maps, settings=settings)
 
     # Passes 2 and 3: the view of the camera.
-    like = settings.lighting.attributes(first, *light(first), view.position)
+    def attributes(scene: Scene) -> SurfaceAttributes:
+        return settings.lighting.attributes(scene, *light(scene), view.position)
 
     (seen,) = _sum_views(
         scenes,
@@ -161,9 +151,9 @@ def render_streamed(
         [view],
         rasterizer,
         splatting,
-        lambda scene: stack_rows(settings.lighting.attributes(scene, *light(scene), view.position)),
+        lambda scene: stack_rows(attributes(scene)),
     )
-    visible, samples = _sample(seen, view, settings, like, bounds.center)
+    visible, samples = _sample(seen, view, settings, attributes(first), bounds.center)
 
     # Pass 4, at the visible points.
     interval = settings.kernel.interval(uneven)

@@ -282,17 +282,17 @@ def test_each_channel_has_a_width_of_its_own_and_its_light_is_counted():
     ]
     slopes[-1:] = [slopes[-1] * channel for channel in np.eye(2)[:, None]]
     slopes = np.reshape(slopes, (len(slopes), -1))
-    found = solution(problem, point)
+    information, unresolved, gaussians, _ = solution(problem, point)
     expected = slopes @ slopes.T
-    np.testing.assert_allclose(found.information, expected, rtol=1e-6, atol=1e-6 * expected.max())
+    np.testing.assert_allclose(information, expected, rtol=1e-6, atol=1e-6 * expected.max())
     own = expected[4:, 4:]
-    np.testing.assert_allclose(found.information[4:, 4:], own, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(information[4:, 4:], own, rtol=1e-6, atol=1e-6)
     assert np.min(np.diagonal(own)) > 1
-    light, gaussians = problem.pictures[0].light, found.gaussians
+    light = problem.pictures[0].light
     resolved = sj.diffusion.resolved_fraction(light.variances, jnp.ones(3), light.interval)
     assert 0.05 < float(resolved[0]) < float(resolved[1]) < 0.6
     expected = (1 - resolved) @ gaussians.weights / gaussians.total_reflectance()
-    np.testing.assert_allclose(found.unresolved, expected, rtol=1e-6)
+    np.testing.assert_allclose(unresolved, expected, rtol=1e-6)
     assert 0.05 < float(jnp.min(expected)) < float(jnp.max(expected)) < 0.98
 
 
