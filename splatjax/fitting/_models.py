@@ -260,11 +260,10 @@ def _fit_compiled(measured, start, beam_variance, model, count) -> MediumFit:
         slopes, residual = jax.jacfwd(lambda point: (residuals(point, None),) * 2, has_aux=True)(
             end.value
         )
-        chi_squared = residual @ residual / max(len(values) - len(point), 1)
         return (
             jnp.exp(end.value),
             invert(slopes.T @ slopes),
-            chi_squared,
+            residual @ residual / max(len(values) - len(point), 1),
             end.result == optx.RESULTS.successful,
         )
 

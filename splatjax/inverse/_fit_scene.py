@@ -63,8 +63,7 @@ def evaluate(
         moved = scene.moved(pictured, x)
         frame = render(moved.scene(scene.material), moved.camera, settings, plan)
         counted = evidence.counted(frame.coverage, background)
-        residuals = evidence.residuals(frame.beauty, counted, loss)
-        return jnp.sum(residuals**2), (counted, frame)
+        return jnp.sum(evidence.residuals(frame.beauty, counted, loss) ** 2), (counted, frame)
 
     (value, (counted, frame)), gradient = jax.value_and_grad(total_loss, has_aux=True)(x)
     return Evaluation(value, gradient, frame.overflow, frame.beauty, counted)
@@ -91,8 +90,11 @@ def advance(
         jnp.sum(evaluation.counted) * evaluation.beauty.shape[2] for evaluation in evaluations
     ]
     count = jnp.maximum(sum(counts), 1.0)
-    gradients = scene.of_all([evaluation.gradient for evaluation in evaluations])
-    gradient = jax.tree.map(lambda *leaves: sum(leaves) / count, gradients, prior_gradient)
+    gradient = jax.tree.map(
+        lambda *leaves: sum(leaves) / count,
+        scene.of_all([evaluation.gradient for evaluation in evaluations]),
+        prior_gradient,
+    )
     loss = (sum(evaluation.loss for evaluation in evaluations) + prior) / count
     finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, gradient))])
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):

@@ -136,8 +136,7 @@ def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> lis
     squared_spacing = float(np.mean(splats.areas))
     # To the splat nearest to the middle of the picture.
     to_splats = np.asarray(splats.centers, float) - eye
-    cosines = to_splats @ forward / np.linalg.norm(to_splats, axis=1)
-    spot = to_splats[np.argmax(cosines)]
+    spot = to_splats[np.argmax(to_splats @ forward / np.linalg.norm(to_splats, axis=1))]
     beam = GaussianBeam(eye, spot, strength * squared_spacing, 4 * squared_spacing)
     lights = {
         name: DirectionalLight(direction=direction, irradiance=strength)
@@ -197,8 +196,7 @@ class HuberLoss(AbstractLoss):
     )
 
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
-        squared = (residuals / self.bend) ** 2
-        return residuals * jnp.sqrt(2 / (1 + jnp.sqrt(1 + squared)))
+        return residuals * jnp.sqrt(2 / (1 + jnp.sqrt(1 + (residuals / self.bend) ** 2)))
 
 
 class AbstractBackground(eqx.Module):

@@ -267,9 +267,12 @@ def search(
     end = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
     cost = jnp.sum(problem.residuals(end.value) ** 2)
     is_better = cost <= unit * unit
-    converged = (end.result == optx.RESULTS.successful) & is_better
-    best = jnp.where(is_better, end.value, start), jnp.where(is_better, cost, unit * unit)
-    return *best, jnp.asarray(end.stats["num_steps"]), converged
+    return (
+        jnp.where(is_better, end.value, start),
+        jnp.where(is_better, cost, unit * unit),
+        jnp.asarray(end.stats["num_steps"]),
+        (end.result == optx.RESULTS.successful) & is_better,
+    )
 
 
 @full_precision

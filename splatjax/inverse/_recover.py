@@ -302,10 +302,14 @@ def next_pictures(
     for candidate, picture in zip(candidates, pictures, strict=True):
         dark = np.zeros(picture.specular.shape)
         observation = Observation(dark, candidate.camera, candidate.lights, deviation=1)
-        evidence = Evidence.of(observation, dtype)
         unknowns = Unknowns.of(medium.eta, [candidate.intensity])
         problem = RecoveryProblem.of(
-            [picture], [evidence], unknowns, fit, SquaredLoss(), recovery.model
+            [picture],
+            [Evidence.of(observation, dtype)],
+            unknowns,
+            fit,
+            SquaredLoss(),
+            recovery.model,
         )
         information, _, _, (radiance,) = solution(problem, unknowns.start(medium))
         radiance = np.asarray(radiance)[np.asarray(problem.counted[0]) > 0]

@@ -238,8 +238,8 @@ class ParameterMap(AbstractPart):
         information = np.swapaxes(slopes, 1, 2) @ slopes / self.step**2
         sizes, axes = np.linalg.eigh(information + np.eye(len(table.names)) / self.deviation**2)
         steps = (axes / np.sqrt(sizes)[:, None]) @ np.swapaxes(axes, 1, 2)
-        mean = SurfaceMean.of(splats, self.smoothness)
-        return MapTables(table, mean, start, jnp.asarray(steps, start.dtype))
+        steps = jnp.asarray(steps, start.dtype)
+        return MapTables(table, SurfaceMean.of(splats, self.smoothness), start, steps)
 
     def coordinates(self, pictured: PicturedScene) -> Float[Array, "splats parameters"]:
         areas = pictured.splats.areas

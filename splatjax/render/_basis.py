@@ -112,8 +112,8 @@ def diffusion_basis(
     check_linear_in_weights(settings)
     scene, plan, light, own_rows = pad_scene(scene, plan, light, camera)
     basis = _diffusion_basis(scene, camera, settings, plan, derivative, light)
-    layers = own_rows.of(basis.light, "variances", "means", "mass", "derivative", "factors")
-    return dataclasses.replace(basis, light=layers)
+    names = "variances", "means", "mass", "derivative", "factors"
+    return dataclasses.replace(basis, light=own_rows.of(basis.light, *names))
 
 
 @kept_jit
@@ -139,7 +139,6 @@ def _diffusion_basis(
         layers, per_exitance = jax.tree.map(in_a_row, rows)
         x, y = visible.grid.columns_and_rows(visible.tiles)
         x, y = jnp.minimum(x, camera.width - 1), jnp.minimum(y, camera.height - 1)
-        in_front = jnp.broadcast_to(visible.in_front[:, None], x.shape)
         return DiffusionBasis(
             light=LayersAtPoints(
                 variances=passes.scene.material.gaussians.variances,
@@ -151,7 +150,7 @@ def _diffusion_basis(
                 invalid_factor(visible.needed) * visible.share.reshape(1, -1) * per_exitance
             ),
             pixels=(y * camera.width + x).reshape(-1),
-            in_front=in_front.reshape(-1).astype(per_exitance.dtype),
+            in_front=jnp.repeat(visible.in_front, x.shape[1]).astype(per_exitance.dtype),
             specular=visible.picture(specular),
             coverage=visible.picture(jnp.ones_like(specular[:, 0])),
             overflow=visible.overflow,
@@ -254,8 +253,7 @@ def _relighting_basis(
     kept = transfer(scene, plan, settings) if light is None else light
 
     def under(harmonics: Float[Array, " harmonics"]):
-        gray = jnp.broadcast_to(harmonics[:, None], template.shape)
-        lit = eqx.tree_at(coefficients, scene, gray)
+        lit = eqx.tree_at(coefficients, scene, jnp.broadcast_to(harmonics[:, None], template.shape))
         frame = render(lit, camera, settings, plan, light=kept)
         return frame.beauty, frame.coverage, frame.overflow
 

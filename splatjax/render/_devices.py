@@ -38,14 +38,14 @@ class OwnRows(NamedTuple):
     def of(self, record: Record, *names: str) -> Record:
         """Remove the padding Gaussians from fields of a record."""
         padded = {name: getattr(record, name) for name in names}
-        rows = jax.tree.map(lambda rows: rows_or_last(rows, self.gaussians), padded)
-        return dataclasses.replace(record, **rows)
+        return dataclasses.replace(
+            record, **jax.tree.map(lambda rows: rows_or_last(rows, self.gaussians), padded)
+        )
 
     def frame(self, frame: Frame) -> Frame:
         """Remove the padding from a frame."""
-        shadow = rows_or_last(frame.shadow, self.lights)
         shown = self.of(frame, "layers", "weights", "unresolved_fraction")
-        return dataclasses.replace(shown, shadow=shadow)
+        return dataclasses.replace(shown, shadow=rows_or_last(frame.shadow, self.lights))
 
 
 def pad_scene(
@@ -73,10 +73,9 @@ def pad_scene(
     material = plan.diffusion.material(scene.material)
     scene = Scene(scene.splats, scene.lights, material)
     layers = len(plan.diffusion.shown(scene).material.gaussians.variances)
-    shown = np.arange(min(plan.gaussians, layers))
-    own_rows = OwnRows(np.arange(len(scene.lights)), shown)
+    own_rows = OwnRows(np.arange(len(scene.lights)), np.arange(min(plan.gaussians, layers)))
     if plan.mesh is not None or is_traced((scene, light, trees)):
-        return scene, plan, None if light is None else resize_visibility(light, scene), own_rows
+        return scene, plan, light, own_rows
     splats, lights, shadows = scene.splats, scene.lights, plan.shadows
     if 0 < splats.count < len(plan.order):
         splats = jax.tree.map(lambda leaf: rows_or_last(leaf, np.arange(len(plan.order))), splats)
@@ -91,9 +90,9 @@ def pad_scene(
             for group, shadow in zip(groups, shadows, strict=True)
         )
     gaussians = pad_gaussians(material.gaussians)
+    count = len(gaussians.variances)
     if splats.weights is not None:
-        rows = np.arange(len(gaussians.variances))
-        weights = rows_or_last(splats.weights.swapaxes(0, 1), rows).swapaxes(0, 1)
+        weights = rows_or_last(splats.weights.swapaxes(0, 1), np.arange(count)).swapaxes(0, 1)
         splats = dataclasses.replace(splats, weights=weights)
     material = eqx.tree_at(
         lambda material: (material.gaussians, material.angles),
@@ -101,10 +100,9 @@ def pad_scene(
         (gaussians, material.angular_law()),
         is_leaf=lambda leaf: leaf is None,
     )
-    counts = {"splats": splats.count, "gaussians": len(gaussians.variances)}
-    plan = dataclasses.replace(plan, shadows=shadows, **counts)
+    plan = dataclasses.replace(plan, shadows=shadows, splats=splats.count, gaussians=count)
     scene = Scene(splats, lights, material)
-    return scene, plan, None if light is None else resize_visibility(light, scene), own_rows
+    return scene, plan, light and resize_visibility(light, scene), own_rows
 
 
 def _pad_lights(
@@ -130,9 +128,9 @@ def rows_or_last(
 
 def resize_visibility(light: Kept, scene: Scene) -> Kept:
     """Pad or cut the rows of visibility of each kind of lights to the samples of a scene."""
-    groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
     visibility = [
-        rows if rows is None else rows_or_last(rows, np.arange(len(g))) for rows, g in groups
+        rows if rows is None else rows_or_last(rows, np.arange(len(samples)))
+        for rows, samples in zip(light.visibility, lights_by_kind(scene.lights), strict=True)
     ]
     return dataclasses.replace(light, visibility=visibility)
 
@@ -185,8 +183,7 @@ def on_devices(
         splats = arrange(scene.splats, plan.order, plan.exists)
         scene = Scene(splats, scene.lights, scene.material)
         rows = jax.tree.map(lambda row: row[plan.order], rows)
-        passes = Passes(scene, settings, plan, combination)
-        return function(passes, *replicated, *rows, *extra)
+        return function(Passes(scene, settings, plan, combination), *replicated, *rows, *extra)
 
     arguments = scene, plan, replicated, rows, extra
     if plan.mesh is None:

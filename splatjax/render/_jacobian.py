@@ -131,9 +131,14 @@ def _picture_jacobian(
                 # The light that depends on a weight has separate layers.
                 layers = samples.layers[:, len(added) :]
                 samples = dataclasses.replace(samples, layers=layers, derivative=None)
-                planned = plan.diffusion.gaussians, plan.interval, settings.kernel
                 gained, _ = layers_at_points(
-                    scene, samples, samples.attributes, added, *planned
+                    scene,
+                    samples,
+                    samples.attributes,
+                    added,
+                    plan.diffusion.gaussians,
+                    plan.interval,
+                    settings.kernel,
                 ).weigh(*weighing)
                 weighted = material.gaussians.weights[:, :, None] * gained
                 of_weights = of_weights + jnp.sum(weighted, axis=0)[None]

@@ -180,8 +180,8 @@ def cast_shadows(
             views = shadow_views(light, bounds, plan.settings, plan.cube)
             stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
             visible, needed = jax.lax.map(of_view, stacked)
-            closeness = plan.closeness(light, bounds)
-            return jnp.sum(visible, axis=0), jnp.maximum(jnp.max(needed), closeness)
+            needed = jnp.maximum(jnp.max(needed), plan.closeness(light, bounds))
+            return jnp.sum(visible, axis=0), needed
 
         if len(group.light_indices) > len(group.distinct):  # in a gradient, maps are rendered again
             of_light = jax.checkpoint(of_light)  # ty: ignore[invalid-assignment]
@@ -235,8 +235,7 @@ def irradiance_at_points(
     reflects = _shading.albedo_under(light.groups, f0, roughness)
 
     def enters(_, cosine):
-        fraction = 1 - reflects(cosine)
-        return fraction[None] * material.diffuse_fraction(cosine).T
+        return (1 - reflects(cosine))[None] * material.diffuse_fraction(cosine).T
 
     irradiance = _shading.sum_received(
         positions, normals, light.groups, light.visibility, enters, material.channels
@@ -248,9 +247,10 @@ def irradiance_at_points(
 
 def irradiance_at_splats(scene: Scene, light: LightVisibility) -> Irradiance:
     """Compute the light that enters every splat."""
-    splats = scene.splats
-    points = splats.centers, splats.normals, splats.albedo
-    return irradiance_at_points(scene.material, light, *points, surface_parameters(scene)[1])
+    splats, (_, roughness) = scene.splats, surface_parameters(scene)
+    return irradiance_at_points(
+        scene.material, light, splats.centers, splats.normals, splats.albedo, roughness
+    )
 
 
 def source_derivative(scene: Scene, light: LightVisibility) -> Float[Array, "channels splats"]:
@@ -275,9 +275,13 @@ def single_scattering_at_splats(
     splats, single = scene.splats, scene.material.single_scattering
     if single is None:
         return None
-    outgoing = _shading.unit_normals(eye[None] - splats.centers)
-    geometry = splats.centers, splats.normals, outgoing
-    points = _shading.SurfacePoints(*geometry, *surface_parameters(scene), light.visibility)
+    points = _shading.SurfacePoints(
+        splats.centers,
+        splats.normals,
+        _shading.unit_normals(eye[None] - splats.centers),
+        *surface_parameters(scene),
+        light.visibility,
+    )
     f0 = _shading.fresnel_f0(scene.material.eta)
     return _shading.single_scattered_radiance(points, light.groups, f0, single)
 

@@ -68,8 +68,10 @@ class SplatLight(eqx.Module):
 
     def take(self, chosen: Int[Array, " chosen"]) -> "SplatLight":
         """Return the light of some splats."""
-        along = dataclasses.replace(self, solved=None)
-        taken = jax.tree.map(lambda leaf: take_points(leaf, chosen) if leaf.ndim else leaf, along)
+        taken = jax.tree.map(
+            lambda leaf: take_points(leaf, chosen) if leaf.ndim else leaf,
+            dataclasses.replace(self, solved=None),
+        )
         return dataclasses.replace(taken, solved=self.solved)
 
 
@@ -189,12 +191,14 @@ class Passes(eqx.Module):
             diffused, _ = summed.light(
                 splats, material, source, beams, kernel, self.combination, at, bounced * root
             )
-            exitance = root[:, at] * diffused.layers.values[0]
-            received = sightlines.irradiance(exitance, splats.normals, self.combination)
+            received = sightlines.irradiance(
+                root[:, at] * diffused.layers.values[0], splats.normals, self.combination
+            )
             return (added * enters * received, jnp.maximum(needed, diffused.needed)), None
 
-        start = jnp.zeros_like(direct.entering), none
-        (bounced, needed), _ = jax.lax.scan(bounce, start, None, length=self.settings.bounces)
+        (bounced, needed), _ = jax.lax.scan(
+            bounce, (jnp.zeros_like(direct.entering), none), None, length=self.settings.bounces
+        )
         # The root of a missing albedo is one.
         entering = direct.entering + bounced
         return Irradiance(entering, entering * root), bounced * root, beams, needed
@@ -229,9 +233,11 @@ class Passes(eqx.Module):
         layers = plan.diffusion.towards(
             camera.position, scene.splats, scene.material, light.layers, light.solved, chosen
         )
-        visibility = LightVisibility(groups, light.visibility, light.needed)
         attributes = settings.lighting.attributes(
-            visible_scene, visibility, light.irradiance, view.position
+            visible_scene,
+            LightVisibility(groups, light.visibility, light.needed),
+            light.irradiance,
+            view.position,
         )
         origin = _splatting.Bounds.of(scene.splats, self.combination).center[:, None]
         origin = jax.lax.stop_gradient(origin)
@@ -255,9 +261,16 @@ class Passes(eqx.Module):
         # Pass 5: shade the visible points.
         def shade_and_read(samples: SurfaceSamples) -> Result:
             samples = jax.tree.map(in_a_row, samples)
-            attributes = settings.lighting.at_pixels(scene, groups, samples)
-            planned = plan.diffusion.gaussians, plan.interval, settings.kernel
-            shaded, layers = shade(shown, view.position, groups, samples, attributes, *planned)
+            shaded, layers = shade(
+                shown,
+                view.position,
+                groups,
+                samples,
+                settings.lighting.at_pixels(scene, groups, samples),
+                plan.diffusion.gaussians,
+                plan.interval,
+                settings.kernel,
+            )
             return read(shaded, layers, samples)
 
         sample = partial(sample_surfaces, visible, attributes, origin)
@@ -267,8 +280,9 @@ class Passes(eqx.Module):
             samples = map_chunks(sample, sums, tiles, at_once=_splatting.TILES_AT_ONCE)
             return map_places(shade_and_read, samples)
 
-        at_once = 2 * _splatting.TILES_AT_ONCE
-        values = map_chunks(sample_and_read, visible.sums, visible.tiles, at_once=at_once)
+        values = map_chunks(
+            sample_and_read, visible.sums, visible.tiles, at_once=2 * _splatting.TILES_AT_ONCE
+        )
         return self.combination.gather(values), visible.gathered(self.combination)
 
 

@@ -176,9 +176,8 @@ def check_plan(plan: Plan, scene: Scene, mesh: Mesh | None = None) -> None:
                 f"the plan is for {planned} {name}, and the scene has {count}; make another plan"
             )
     if mesh is not None and plan.mesh != mesh:
-        made_for = "one device" if plan.mesh is None else f"{plan.mesh}"
         raise ValueError(
-            f"the plan is for {made_for}, not for {mesh}; make it with "
+            f"the plan is for {plan.mesh or 'one device'}, not for {mesh}; make it with "
             "splatjax.make_plan(..., mesh=mesh)"
         )
 

@@ -99,8 +99,7 @@ def render_streamed(
 
     def scenes(task: str) -> Iterator[Scene]:
         for part in stream(task):
-            scene = Scene(pad_splats(part, part_size), tuple(lights), material)
-            yield in_one_dtype(scene)[0]
+            yield in_one_dtype(Scene(pad_splats(part, part_size), tuple(lights), material))[0]
 
     first = next(iter(scenes("looking")))
     check_channels(first)
@@ -256,8 +255,9 @@ def _sample(
 ) -> tuple[_splatting.VisibleSurfaces, SurfaceSamples]:
     visible = _splatting.VisibleSurfaces.of(sums, view, settings.splatting, PartByPart())
     sample = partial(sample_surfaces, visible, like, origin[:, None])
-    at_once = _splatting.TILES_AT_ONCE
-    return visible, map_chunks(sample, visible.sums, visible.tiles, at_once=at_once)
+    return visible, map_chunks(
+        sample, visible.sums, visible.tiles, at_once=_splatting.TILES_AT_ONCE
+    )
 
 
 @full_precision
@@ -277,7 +277,16 @@ def _shade(
         samples, layers = jax.tree.map(in_a_row, (samples, layers))
         samples = dataclasses.replace(samples, layers=layers)
         attributes = settings.lighting.at_pixels(scene, groups, samples)
-        planned = gaussians, interval, settings.kernel
-        return shade(scene, view.position, groups, samples, attributes, *planned)[0]
+        shaded, _ = shade(
+            scene,
+            view.position,
+            groups,
+            samples,
+            attributes,
+            gaussians,
+            interval,
+            settings.kernel,
+        )
+        return shaded
 
     return compose(scene, map_places(shade_places, samples, layers), visible)
