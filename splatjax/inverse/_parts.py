@@ -99,9 +99,10 @@ class AlbedoMap(AbstractPart):
         return jnp.zeros_like(pictured.splats.albedo)
 
     def moved(self, pictured: PicturedScene, x, prepared) -> PicturedScene:
-        start = jnp.clip(pictured.splats.albedo, BOUNDED, 1 - BOUNDED)
-        albedo = jax.nn.sigmoid(jax.scipy.special.logit(start) + self.step * x)
-        return eqx.tree_at(lambda s: s.splats.albedo, pictured, albedo)
+        start = jax.scipy.special.logit(jnp.clip(pictured.splats.albedo, BOUNDED, 1 - BOUNDED))
+        return eqx.tree_at(
+            lambda s: s.splats.albedo, pictured, jax.nn.sigmoid(start + self.step * x)
+        )
 
     def prior_residuals(self, x: Float[Array, "splats channels"], prepared: None):
         return self.step / self.deviation * x

@@ -256,7 +256,7 @@ class Prediction(eqx.Module):
     @property
     def worst(self) -> Combination:
         """The combination with the largest error in any channel."""
-        worst = [best_and_worst(covariance)[1] for covariance in self.covariance]
+        worst = (best_and_worst(covariance)[1] for covariance in self.covariance)
         return max(worst, key=lambda combination: combination.deviation)
 
     def __str__(self) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
+from splatjax._chunking import Result
 from splatjax._combination import AbstractCombination, DeviceMesh, lay_out
 from splatjax._records import is_traced
 from splatjax.gaussians import pad_gaussians
@@ -24,7 +25,6 @@ from ._passes import Passes, SplatLight
 from ._plan import Plan, arrange, pad_splats, splats_per_device
 from ._settings import RenderSettings
 
-Result = TypeVar("Result", bound=PyTree)
 Record = TypeVar("Record", bound=eqx.Module)
 Kept = TypeVar("Kept", bound=SplatLight | Transfer)
 

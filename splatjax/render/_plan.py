@@ -129,7 +129,6 @@ def make_plan(
     parts, order, exists = _cut_and_order(scene.splats, mesh)
     bounds, interval, splatting = _measure(parts, settings)
     gaussians = scene.material.gaussians
-    variances = pad_gaussians(gaussians).variances
     raster = settings.rasterizer.make_plan(parts, views, settings.splatting)
     plan = Plan(
         order=order,
@@ -138,7 +137,9 @@ def make_plan(
             _plan_shadows(group, parts, bounds, settings)
             for group in _groups([scene.lights for scene in (scene, *other_scenes)])
         ),
-        diffusion=settings.diffuser.make_plan(parts, variances, settings.kernel, interval),
+        diffusion=settings.diffuser.make_plan(
+            parts, pad_gaussians(gaussians).variances, settings.kernel, interval
+        ),
         interval=interval,
         splatting=splatting,
         raster=raster.fitted(parts, views, splatting),

@@ -242,14 +242,19 @@ def _diffuse_irradiance(
                 sources, gaussians.variances, settings.kernel, passes.combination, chosen
             )
             seen = take_points(source, chosen)
-            irradiance = Irradiance(entering=seen, source=seen)
-            return SplatLight([], irradiance, diffused.layers, None, None, diffused.needed)
+            return SplatLight(
+                visibility=[],
+                irradiance=Irradiance(entering=seen, source=seen),
+                layers=diffused.layers,
+                derivative=None,
+                added_source=None,
+                needed=diffused.needed,
+            )
 
         def read(shaded, layers, samples):
             return layers.weigh(gaussians, material.single_scattering_albedo())[0]
 
         layers, visible = passes.picture(camera, light_at, read)
-        return visible.front_picture(layers)
+        return jnp.moveaxis(visible.front_picture(layers), 2, 0)
 
-    picture = on_devices(diffuse, dark, plain, plan, camera, rows=(irradiance,))
-    return jnp.moveaxis(picture, 2, 0)
+    return on_devices(diffuse, dark, plain, plan, camera, rows=(irradiance,))

@@ -75,17 +75,15 @@ class StreamStatistics:
         smaller and not the last.
         """
         # Sizes, extent and areas.
-        sizes, low, high, area, square, count, radius = [], [], [], 0.0, 0.0, 0, 0.0
+        sizes, boxes, largest, sums = [], [], [], []
         for part in filter(lambda part: part.count, parts()):
-            axes, areas = np.asarray(part.centers).T, np.asarray(part.areas)
+            areas, radii = np.asarray(part.areas), np.asarray(part.radii)
             sizes.append(part.count)
-            count += np.count_nonzero(areas)
-            low.append([axis.min() for axis in axes])  # quicker than over an axis of three
-            high.append([axis.max() for axis in axes])
-            area += float(areas.sum(dtype=np.float64))
-            radii = np.asarray(part.radii)
-            square += float(np.sum(radii**2, where=areas > 0, dtype=np.float64))
-            radius = max(radius, float(radii.max()))
+            # Quicker than over an axis of three.
+            boxes.append([(axis.min(), axis.max()) for axis in np.asarray(part.centers).T])
+            largest.append(radii.max())
+            squares = np.sum(radii**2, where=areas > 0, dtype=np.float64)
+            sums.append((np.count_nonzero(areas), areas.sum(dtype=np.float64), squares))
         if not sizes:
             raise ValueError("parts has no splats; give at least one")
         if any(size != sizes[0] for size in sizes[:-1]) or sizes[-1] > sizes[0]:
@@ -94,7 +92,8 @@ class StreamStatistics:
                 "splats"
             )
         # Distance of the farthest splat, finest areas, and unevenness.
-        middle = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
+        count, area, square = np.sum(sums, axis=0).tolist()
+        middle = (np.min(boxes, axis=0)[:, 0] + np.max(boxes, axis=0)[:, 1]) / 2
         farthest, finest, uneven = 0.0, np.zeros(0), 0.0
         rank = _diffusion.FINE_QUANTILE * max(count - 1, 0)
         for part in filter(lambda part: part.count, parts()):
@@ -105,7 +104,7 @@ class StreamStatistics:
         return cls(
             part_size=sizes[0],
             middle=middle,
-            reach=math.sqrt(farthest) + radius,
+            reach=math.sqrt(farthest) + float(max(largest)),
             spacing=math.sqrt(area / count) if count else math.inf,
             fine=float(np.interp(rank, np.arange(len(finest)), finest)) if count else math.inf,
             discs=square / area if area else 1.0,
