@@ -280,8 +280,9 @@ def refine(
     unknown = jnp.full((), jnp.inf, start.dtype)
     # The best point with its cost and gain, the next step, whether to continue, and the step count.
     state = (start, unknown, unknown), jnp.zeros_like(start), jnp.asarray(True), jnp.asarray(0)
-    best, *_ = jax.lax.while_loop(lambda state: state[2] & (state[3] <= _NEWTON_STEPS), step, state)
-    point, cost, gain = best
+    (point, cost, gain), *_ = jax.lax.while_loop(
+        lambda state: state[2] & (state[3] <= _NEWTON_STEPS), step, state
+    )
     floor = (_FLOOR * float(jnp.finfo(start.dtype).eps)) ** 2
     return point, gain <= _GAIN * cost + floor
 

@@ -115,10 +115,9 @@ def _warnings(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
         for field in (scene.splats.centers, scene.splats.normals, scene.splats.areas)
     )
     for number, light in enumerate(scene.lights, 1):
-        is_flat = isinstance(light, RectangleLight | DiskLight)
         if (
             is_lit
-            and is_flat
+            and isinstance(light, RectangleLight | DiskLight)
             and np.all((centers - np.asarray(light.center)) @ np.cross(*light.axes()) < 0)
         ):
             yield (
