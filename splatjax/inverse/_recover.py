@@ -303,13 +303,9 @@ def next_pictures(
         dark = np.zeros(picture.specular.shape)
         observation = Observation(dark, candidate.camera, candidate.lights, deviation=1)
         unknowns = Unknowns.of(medium.eta, [candidate.intensity])
+        evidence = [Evidence.of(observation, dtype)]
         problem = RecoveryProblem.of(
-            [picture],
-            [Evidence.of(observation, dtype)],
-            unknowns,
-            fit,
-            SquaredLoss(),
-            recovery.model,
+            [picture], evidence, unknowns, fit, SquaredLoss(), recovery.model
         )
         information, _, _, (radiance,) = solution(problem, unknowns.start(medium))
         radiance = np.asarray(radiance)[np.asarray(problem.counted[0]) > 0]
