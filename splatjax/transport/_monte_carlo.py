@@ -12,8 +12,8 @@ from splatjax._records import Numbers, as_floats, check_values, is_traced
 from splatjax.scattering import Film, Layer, check_stack
 
 from ._results import MonteCarlo, assemble
-from ._rounds import Walk, WalkSettings, finish
-from ._walk import AbstractIncidence, NormalIncidence, Optics, Stack
+from ._rounds import Walk, finish
+from ._walk import AbstractIncidence, NormalIncidence, Stack
 
 _FLIGHTS = 20_000
 
@@ -80,7 +80,7 @@ class LayeredMedia(eqx.Module):
 
         Under `jit`, where values are unknown, each channel has its own walk.
         """
-        geometry = (self.sigma_s, self.thickness, self.eta)
+        geometry = jax.lax.stop_gradient((self.sigma_s, self.thickness, self.eta))
         if is_traced(geometry):
             return [np.asarray([channel]) for channel in range(self.sigma_a.shape[1])]
         sigma_s, thickness, eta = (np.asarray(values) for values in geometry)
@@ -163,12 +163,24 @@ def monte_carlo(
     check_values(
         "the steps of edges", steps, "positive (mm), with ascending edges", lambda x: x > 0
     )
-    numbers = jnp.asarray(photons, jnp.int32), jnp.asarray(flights, jnp.int32)
     lanes = max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length())
-    settings = WalkSettings(edges, incidence, key, *numbers, min(_MOST_LANES, lanes))
-    moments = _walk_all(media, settings, progress=progress)
+    settings = {
+        "incidence": incidence,
+        "photons": jnp.asarray(photons, jnp.int32),
+        "flights": jnp.asarray(flights, jnp.int32),
+        "lanes": min(_MOST_LANES, lanes),
+    }
+    groups, means = media.shared_walks(), []
+    for number, group in enumerate(groups):
+        channels = jnp.asarray(group.astype(np.int32))
+        walk = _walk_of(media, jnp.asarray(number), channels, edges, key, **settings)
+        report = progress and (
+            lambda done, before=number: progress(before * photons + done, len(groups) * photons)
+        )
+        means.append(_mean_moments(walk, progress=report))
+    order = jnp.asarray(np.argsort(np.concatenate(groups)).astype(np.int32))
     specular = incidence.reflected(media.eta[1] / media.eta[0])
-    return assemble(moments, edges, settings.photons, specular)
+    return assemble(jnp.concatenate(means)[order], edges, settings["photons"], specular)
 
 
 @eqx.filter_jit
@@ -186,20 +198,19 @@ def _prepare(layers, g, eta_above, eta_below, edges):
 
 
 @eqx.filter_custom_jvp
-def _walk_all(
-    media: LayeredMedia, settings: WalkSettings, *, progress
-) -> Float[Array, "channels places two"]:
+def _mean_moments(walk: Walk, *, progress) -> Float[Array, "channels places two"]:
     """Compute the means of weights and of their squares, by channel and place."""
-    return _mean_moments(media, settings, False, progress)
+    return finish(walk, False, progress)
 
 
-@_walk_all.def_jvp
-def _walk_all_jvp(primals, tangents, *, progress):
-    (media, settings), (media_dot, settings_dot) = primals, tangents
+@_mean_moments.def_jvp
+def _mean_moments_jvp(primals, tangents, *, progress):
+    (walk,), (walk_dot,) = primals, tangents
+    stack_dot = walk_dot.stack
     for name, tangent in (
-        ("thickness", media_dot.thickness),
-        ("eta", media_dot.eta),
-        ("edges and g", (media_dot.g, settings_dot)),
+        ("thickness", stack_dot.thickness),
+        ("eta", stack_dot.eta),
+        ("edges and g", (stack_dot.g, walk_dot.edges, walk_dot.incidence)),
     ):
         if jax.tree.leaves(tangent):
             raise ValueError(
@@ -207,57 +218,37 @@ def _walk_all_jvp(primals, tangents, *, progress):
                 "differentiate sigma_a and sigma_s_prime, or take differences of results with "
                 "the same key"
             )
-    moments = _mean_moments(media, settings, True, progress)
-    none = jnp.zeros_like(media.sigma_a)
-    along = [none if dot is None else dot for dot in (media_dot.sigma_a, media_dot.sigma_s)]
+    moments = finish(walk, True, progress)
+    none = jnp.zeros_like(walk.sigma_a)
+    along = [none if dot is None else dot for dot in (walk_dot.sigma_a, walk_dot.sigma_s)]
     slope = jnp.einsum("crp,pc->cr", moments[..., 2:], jnp.concatenate(along))
     return moments[..., :2], jnp.stack([slope, jnp.zeros_like(slope)], axis=-1)
-
-
-def _mean_moments(media: LayeredMedia, settings: WalkSettings, with_slopes: bool, progress):
-    """Walk each group of channels that share a walk, and put the channels in their order."""
-    groups, means = media.shared_walks(), []
-    count = settings.photons.astype(settings.edges.dtype)
-    for number, group in enumerate(groups):
-        channels = jnp.asarray(group.astype(np.int32))
-        walk = _walk_of(media, settings, jnp.asarray(number), channels, with_slopes)
-        report = progress and (
-            lambda done, photons, before=number: progress(
-                before * photons + done, len(groups) * photons
-            )
-        )
-        means.append(finish(walk, report).over(count))
-    order = jnp.asarray(np.argsort(np.concatenate(groups)).astype(np.int32))
-    return jnp.concatenate(means)[order]
 
 
 @eqx.filter_jit
 def _walk_of(
     media: LayeredMedia,
-    settings: WalkSettings,
     number: Int[Array, ""],
     group: Int[Array, " group"],
-    with_slopes: bool,
+    edges: Float[Array, " edges"],
+    key: Key[Array, ""],
+    **settings,
 ) -> Walk:
     """Set up the walk of a group of channels, in the free paths of the first of them."""
-    sigma_a, sigma_s, first = media.sigma_a[:, group], media.sigma_s[:, group], group[0]
+    first = group[0]
     # The unit of length: the free path between scatterings in the first layer that scatters, mm.
-    unit = 1 / sigma_s[media.first]
-    stack = Stack(
-        sigma_s[:, 0] * unit[0], media.thickness[:, first] / unit[0], media.eta[:, first], media.g
-    )
-    absorption = sigma_a * unit[None]
-    # Slopes in the absorption of each layer, and in the scattering of each.
-    layers = len(sigma_a)
-    eye = jnp.broadcast_to(jnp.eye(layers, dtype=unit.dtype)[..., None], (layers, *sigma_a.shape))
-    length, none = eye * unit[None, None], jnp.zeros_like(eye)
-    ratio = eye / jnp.where(sigma_s > 0, sigma_s, jnp.inf)[None]
-    slopes = Optics(*map(jnp.concatenate, ([length, none], [length, length], [none, ratio])))
+    unit = jax.lax.stop_gradient(1 / media.sigma_s[media.first, group])
+    sigma_a, sigma_s = (values[:, group] * unit[None] for values in (media.sigma_a, media.sigma_s))
     return Walk(
-        settings=settings,
-        key=jax.random.fold_in(settings.key, number),
-        stack=stack,
-        optics=Optics(absorption, absorption, jnp.ones_like(absorption)),
-        slopes=slopes if with_slopes else jax.tree.map(lambda leaf: leaf[:0], slopes),
-        edges=settings.edges[None] / unit[:, None],
+        stack=Stack(
+            jax.lax.stop_gradient(sigma_s[:, 0]),
+            media.thickness[:, first] / unit[0],
+            media.eta[:, first],
+            media.g,
+        ),
+        sigma_a=sigma_a,
+        sigma_s=sigma_s,
+        edges=edges[None] / unit[:, None],
+        key=jax.random.fold_in(key, number),
+        **settings,
     )

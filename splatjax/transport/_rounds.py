@@ -18,7 +18,6 @@ from ._walk import (
     IDLE,
     INSIDE,
     AbstractIncidence,
-    Optics,
     PathWeights,
     Photons,
     Stack,
@@ -40,35 +39,28 @@ _UNWATCHED = 8
 _LEAST, _SURVIVING = 1e-4, 0.1
 
 
-class WalkSettings(eqx.Module):
-    """The settings of walks. The number of photons is traced: it needs no program of its own."""
-
-    edges: Float[Array, " edges"]
-    incidence: AbstractIncidence
-    key: Key[Array, ""]
-    photons: Int[Array, ""]
-    flights: Int[Array, ""]
-    lanes: int = eqx.field(static=True)
-
-
 class Walk(eqx.Module):
-    r"""The constants of a walk.
+    r"""The constants of a walk, in free paths of the stack.
 
     **Attributes:**
 
-    - `settings`: of all walks.
-    - `key`: of this one.
-    - `optics`: of the channels that walk along; `slopes` are its derivatives in the absorption of
-      each layer, then in the scattering of each; or none.
-    - `edges`: of the rings, in free paths of the stack, for each channel.
+    - `stack`: the layers, by which photons fly.
+    - `sigma_a`, `sigma_s`: coefficients of the channels that walk along. Differentiable.
+    - `edges`: of the rings, for each channel.
+    - `key`: of this walk.
+    - `photons`, `flights`: numbers of photons and of their flights. They are traced, so that they
+      need no program of their own.
     """
 
-    settings: WalkSettings
-    key: Key[Array, ""]
     stack: Stack
-    optics: Optics
-    slopes: Optics
+    sigma_a: Float[Array, "layers channels"]
+    sigma_s: Float[Array, "layers channels"]
     edges: Float[Array, "channels edges"]
+    key: Key[Array, ""]
+    incidence: AbstractIncidence
+    photons: Int[Array, ""]
+    flights: Int[Array, ""]
+    lanes: int = eqx.field(static=True)
 
 
 class _State(eqx.Module):
@@ -81,35 +73,40 @@ class _State(eqx.Module):
 
     @jit_unless_traced
     def unfinished(self, walk: Walk) -> Bool[Array, ""]:
-        return (self.started < walk.settings.photons) | jnp.any(self.photons.place == INSIDE)
+        return (self.started < walk.photons) | jnp.any(self.photons.place == INSIDE)
 
 
-def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Sum:
-    """Walk all photons to their end. Under `jit` in one loop, else call by call, reporting progress
-    in between.
+def finish(
+    walk: Walk, with_slopes: bool, progress: Callable[[int], None] | None
+) -> Float[Array, "channels places moments"]:
+    """Walk all photons to their end, and compute means over them. Under `jit` in one loop, else
+    call by call, reporting the number of finished photons in between.
+
+    **Returns:** the moments of `photon_moments`, with derivatives in the absorption of each layer,
+    then in the scattering of each; or with none.
     """
-    state = _start(walk)
+    state = _start(walk, with_slopes)
     if is_traced(state.started):
-        return jax.lax.while_loop(
+        state = jax.lax.while_loop(
             lambda state: state.unfinished(walk), lambda state: _round(walk, state), state
-        ).tally
-    while bool(state.unfinished(walk)):
-        state = _advance(walk, state)
-        if progress is not None:
-            under_way = int(np.sum(np.asarray(state.photons.place) == INSIDE))
-            progress(int(state.started) - under_way, int(walk.settings.photons))
-    return state.tally
+        )
+    else:
+        while bool(state.unfinished(walk)):
+            state = _advance(walk, state)
+            if progress is not None:
+                under_way = int(np.sum(np.asarray(state.photons.place) == INSIDE))
+                progress(int(state.started) - under_way)
+    return state.tally.over(walk.photons.astype(walk.edges.dtype))
 
 
 @eqx.filter_jit
-def _start(walk: Walk) -> _State:
-    dtype, (layers, channels) = walk.edges.dtype, walk.optics.absorption.shape
-    parameters, rings = walk.slopes.absorption.shape[0], walk.edges.shape[1] - 1
-    zero, number = jnp.zeros(walk.settings.lanes, dtype), jnp.zeros(walk.settings.lanes, jnp.int32)
+def _start(walk: Walk, with_slopes: bool) -> _State:
+    dtype, (layers, channels) = walk.edges.dtype, walk.sigma_a.shape
+    parameters, rings = 2 * layers * with_slopes, walk.edges.shape[1] - 1
+    zero, number = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
     photons = Photons(zero, zero, zero, (zero, zero, zero + 1), zero, number, number + IDLE, number)
     weights = PathWeights(
-        jnp.zeros((channels, walk.settings.lanes), dtype),
-        jnp.zeros((layers, channels, walk.settings.lanes), dtype),
+        jnp.zeros((channels, walk.lanes), dtype), jnp.zeros((layers, channels, walk.lanes), dtype)
     )
     slopes = jax.tree.map(lambda leaf: jnp.zeros((parameters, *leaf.shape), dtype), weights)
     tally = Sum.zeros((channels, 2 * rings + 3 + layers, 2 + parameters), dtype)
@@ -131,30 +128,33 @@ def _round(walk: Walk, state: _State) -> _State:
     """Fly, count the photons that have ended, and start others in their lanes."""
     draws = state.round * (_FLIGHTS + 2)
 
-    def path(optics, weights):
+    def path(sigma_a, sigma_s, weights):
         def flight(number, carry):
             photons, weights = carry
-            xi = uniforms(walk.key, draws + number, walk.settings.lanes, weights.carried.dtype)
+            xi = uniforms(walk.key, draws + number, walk.lanes, weights.carried.dtype)
             moved, *flown = fly(walk.stack, photons, xi)
-            return moved, weigh(optics, weights, photons.layer, *flown)
+            return moved, weigh(sigma_a, sigma_s, weights, photons.layer, *flown)
 
         photons, weights = jax.lax.fori_loop(0, _FLIGHTS, flight, (state.photons, weights))
         return weights, photons
 
-    if walk.slopes.absorption.shape[0]:
+    start, slopes = (walk.sigma_a, walk.sigma_s, state.weights), state.slopes
+    parameters = len(slopes.carried)
+    if parameters:
+        layers, channels = walk.sigma_a.shape
+        steps = jnp.eye(parameters, dtype=walk.edges.dtype).reshape(parameters, 2, layers, 1)
+        steps = jnp.broadcast_to(steps, (parameters, 2, layers, channels))
 
-        def push(optics, weights):
-            return jax.jvp(path, (walk.optics, state.weights), (optics, weights), has_aux=True)
+        def push(step, slopes):
+            return jax.jvp(path, start, (*step, slopes), has_aux=True)
 
-        weights, slopes, photons = jax.vmap(push, out_axes=(None, 0, None))(
-            walk.slopes, state.slopes
-        )
+        weights, slopes, photons = jax.vmap(push, out_axes=(None, 0, None))(steps, slopes)
     else:
-        (weights, photons), slopes = path(walk.optics, state.weights), state.slopes
+        weights, photons = path(*start)
 
     inside = photons.place == INSIDE
     faint = inside & (jnp.max(weights.carried, axis=0) < _LEAST)
-    chance = uniforms(walk.key, draws + _FLIGHTS, walk.settings.lanes, walk.edges.dtype)[0]
+    chance = uniforms(walk.key, draws + _FLIGHTS, walk.lanes, walk.edges.dtype)[0]
     dropped = faint & (chance > _SURVIVING)
     boost = jnp.where(faint & ~dropped, 1 / _SURVIVING, jnp.ones_like(chance))
     weights, slopes = (
@@ -164,7 +164,7 @@ def _round(walk: Walk, state: _State) -> _State:
     done = (
         ((photons.place != INSIDE) & (photons.place != IDLE))
         | dropped
-        | (inside & (photons.flights >= walk.settings.flights))
+        | (inside & (photons.flights >= walk.flights))
     )
     ended = photon_moments(photons, weights, slopes, done, dropped, walk.edges)
     tally = state.tally.plus(ended)
@@ -176,12 +176,12 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
     """Start photons in free lanes, as long as there are any left."""
     dtype = walk.edges.dtype
     turn = jnp.cumsum(free.astype(jnp.int32))
-    begins = free & (state.started + turn <= walk.settings.photons)
-    xi = uniforms(walk.key, state.round * (_FLIGHTS + 2) + _FLIGHTS + 1, walk.settings.lanes, dtype)
+    begins = free & (state.started + turn <= walk.photons)
+    xi = uniforms(walk.key, state.round * (_FLIGHTS + 2) + _FLIGHTS + 1, walk.lanes, dtype)
     spread = evenly(walk.key, state.started + turn, dtype)
-    direction, weight = walk.settings.incidence.enter(spread, xi[1], walk.stack.eta[:2])
+    direction, weight = walk.incidence.enter(spread, xi[1], walk.stack.eta[:2])
 
-    zero, number = jnp.zeros(walk.settings.lanes, dtype), jnp.zeros(walk.settings.lanes, jnp.int32)
+    zero, number = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
     place = jnp.where(begins, INSIDE, IDLE)
     fresh = Photons(zero, zero, zero, direction, -jnp.log(xi[2]), number, place, number)
     photons = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, state.photons)

@@ -173,25 +173,6 @@ class PathWeights(eqx.Module):
     absorbed: Float[Array, "*slopes layers channels photons"]
 
 
-class Optics(eqx.Module):
-    r"""The coefficients that determine weights, per free path of the stack. Only these are
-    differentiable.
-
-    **Attributes:**
-
-    - `absorption`: absorption coefficients.
-    - `removal`: absorption, and scattering in excess of that by which flights are drawn.
-    - `ratio`: scattering over that by which flights are drawn. 1 in value.
-
-    The likelihood of a path under other coefficients than those it was drawn by is a product over
-    its flights and scatterings: its derivative is the path's share in that of every mean.
-    """
-
-    absorption: Float[Array, "*slopes layers channels"]
-    removal: Float[Array, "*slopes layers channels"]
-    ratio: Float[Array, "*slopes layers channels"]
-
-
 def scatter(
     direction: Direction,
     g: Float[Array, " photons"],
@@ -286,17 +267,26 @@ def fly(
 
 
 def weigh(
-    optics: Optics,
+    sigma_a: Float[Array, "layers channels"],
+    sigma_s: Float[Array, "layers channels"],
     weights: PathWeights,
     layer: Int[Array, " photons"],
     length: Float[Array, " photons"],
     scattered: Bool[Array, " photons"],
 ) -> PathWeights:
-    """Update weights along a flight in a layer: absorption is its mean, not sampled."""
+    """Update weights along a flight in a layer: absorption is its mean, not sampled. Differentiable
+    in the coefficients, per free path of the stack.
+
+    The likelihood of a path under other scattering coefficients than those it was drawn by is a
+    product over its flights and scatterings: its derivative is the path's share in that of every
+    mean. In value it is 1.
+    """
+    drawn = jax.lax.stop_gradient(sigma_s)
+    ratio = jnp.where(drawn > 0, sigma_s / jnp.where(drawn > 0, drawn, 1.0), 1.0)
     length, scattered = (jnp.broadcast_to(x, weights.carried.shape) for x in (length, scattered))
-    removal = of_layer(optics.removal, layer) * length
-    absorbed = weights.carried * of_layer(optics.absorption, layer) * length * mean_decay(removal)
-    ratio = jnp.where(scattered, of_layer(optics.ratio, layer), 1.0)
+    removal = of_layer(sigma_a + (sigma_s - drawn), layer) * length
+    absorbed = weights.carried * of_layer(sigma_a, layer) * length * mean_decay(removal)
+    ratio = jnp.where(scattered, of_layer(ratio, layer), 1.0)
     layers = jnp.broadcast_to(
         jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None],
         weights.absorbed.shape,
