@@ -28,11 +28,9 @@ def free_bytes() -> float:
     limit of the address space.
     """
     free = float(psutil.virtual_memory().available)
-    try:
-        import resource  # not on Windows
-    except ImportError:
-        return free
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit == resource.RLIM_INFINITY:
-        return free
-    return max(min(free, limit - psutil.Process().memory_info().vms), 0.0)
+    if hasattr(psutil, "RLIMIT_AS"):  # not on Windows and macOS
+        process = psutil.Process()
+        limit = process.rlimit(psutil.RLIMIT_AS)[0]
+        if limit != psutil.RLIM_INFINITY:
+            free = min(free, limit - process.memory_info().vms)
+    return max(free, 0.0)

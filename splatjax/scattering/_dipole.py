@@ -174,10 +174,7 @@ def screening(y: Float[Array, "..."]) -> Float[Array, "..."]:
     return (1 + root) * jnp.exp(-root)
 
 
-@screening.defjvp
-def _screening_jvp(primals, tangents):
-    (y,), (y_dot,) = primals, tangents
-    return screening(y), -0.5 * jnp.exp(-jnp.sqrt(y)) * y_dot
+screening.defjvps(lambda y_dot, _, y: -0.5 * jnp.exp(-jnp.sqrt(y)) * y_dot)
 
 
 @jax.custom_jvp
@@ -193,17 +190,18 @@ def fluence_difference(
     return jnp.exp(-s * a) / a - jnp.exp(-s * b) / b
 
 
-@fluence_difference.defjvp
-def _fluence_difference_jvp(primals, tangents):
-    u, near, far = primals
-    u_dot, near_dot, far_dot = tangents
+def _fluence_along_u(u_dot, _, u, near, far):
     s, a, b = jnp.sqrt(u), jnp.sqrt(near), jnp.sqrt(far)
-    along_u = -0.5 * (b - a) * jnp.exp(-s * a) * mean_decay(s * (b - a))
-    along_near = -0.5 * screening(u * near) / (near * a)
-    along_far = 0.5 * screening(u * far) / (far * b)
-    return fluence_difference(
-        u, near, far
-    ), along_u * u_dot + along_near * near_dot + along_far * far_dot
+    return -0.5 * (b - a) * jnp.exp(-s * a) * mean_decay(s * (b - a)) * u_dot
+
+
+fluence_difference.defjvps(
+    _fluence_along_u,
+    lambda near_dot, _, u, near, far: (
+        -0.5 * screening(u * near) / (near * jnp.sqrt(near)) * near_dot
+    ),
+    lambda far_dot, _, u, near, far: 0.5 * screening(u * far) / (far * jnp.sqrt(far)) * far_dot,
+)
 
 
 def searchlight_scaling(albedo: Float[Array, " channels"]) -> Float[Array, " channels"]:

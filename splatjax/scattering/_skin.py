@@ -258,12 +258,10 @@ class Skin(eqx.Module):
 
     def profile(self) -> "SkinProfile":
         """Return the profile of light along the normal, with the total of light transport."""
-        half_space = self.half_space()
-        total, dermis, cover = half_space.total_reflectance(), half_space.medium, half_space.cover
-        assert cover is not None
+        (epidermis, dermis), whole = self.media(), self.half_space()
         black = Medium(1e6 * dermis.sigma_s_prime, dermis.sigma_s_prime, dermis.eta)
-        shallow = HalfSpace(black, half_space.g, cover).total_reflectance()
-        return SkinProfile(dermis, total - shallow, cover.medium, shallow)
+        shallow = HalfSpace(black, whole.g, whole.cover).total_reflectance()
+        return SkinProfile(dermis, whole.total_reflectance() - shallow, epidermis, shallow)
 
 
 @record

@@ -11,7 +11,7 @@ from media import balance, layer, reflectance
 
 import splatjax as sj
 from splatjax.transport._results import Sum, total
-from splatjax.transport._rounds import threefry
+from splatjax.transport._rounds import uniforms
 from splatjax.transport._walk import fresnel, scatter
 
 KEY = jax.random.key(2026)
@@ -139,9 +139,17 @@ HALF_SPACE = [layer([0.1, 0.1], 1.0, 1.0)]
 
 @pytest.mark.once
 def test_random_words_are_those_of_jax():
-    words = jax.random.bits(KEY_OF_PARTS, (4, 100), jnp.uint32)
-    expected = threefry_2x32(words[:2, 0], words[2:].reshape(-1))
-    np.testing.assert_array_equal(jnp.concatenate(threefry(*words[:2, 0], *words[2:])), expected)
+    number, lanes = jnp.asarray(7), jnp.arange(100, dtype=jnp.uint32)
+    words = [
+        threefry_2x32(
+            jax.random.key_data(KEY_OF_PARTS),
+            jnp.concatenate([lanes, jnp.full_like(lanes, 14 + half)]),
+        )
+        for half in (0, 1)
+    ]
+    expected = ((jnp.concatenate(words).reshape(4, 100) >> 8) + 1) / 2**24
+    found = uniforms(KEY_OF_PARTS, number, 100, jnp.float32)
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("g", [-0.6, 0.0, 1e-6, 0.5, 0.95])
