@@ -132,15 +132,13 @@ def outward_signs(
         around += votes[neighbor] * np.sign(np.einsum("ni,ni->n", normals, normals[neighbor]))
         cast_around += cast[neighbor]
     sure = np.abs(around) > _SURE * (cast_around + _DOUBT * (1 + near.shape[1]))
-    signs, patches = _carried(
-        points, normals, near, np.flatnonzero(sure), np.where(around < 0, -1.0, 1.0)
-    )
+    signs, patches = _carried(points, normals, near, sure, np.where(around < 0, -1.0, 1.0))
     if not sure.any() or not patches:
         return signs
     areas = np.pi / near.shape[1] * reaches**2
     _turn_cavities(points, (areas * signs)[:, None] * normals, patches, signs)
     sure[np.concatenate(patches)] = True  # points between patches follow them
-    return _carried(points, normals, near, np.flatnonzero(sure), signs)[0]
+    return _carried(points, normals, near, sure, signs)[0]
 
 
 def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs, Signs]:
@@ -186,11 +184,11 @@ def _agreement(
 def _carried(
     points: np.ndarray, normals: np.ndarray, near: np.ndarray, sure: np.ndarray, signs: Signs
 ) -> tuple[Signs, list[np.ndarray]]:
-    """Propagate signs from points with certain signs to all others; also return the smoothly
+    """Propagate signs from the points marked as sure to all others; also return the smoothly
     connected patches of the others.
     """
     count, neighbors = near.shape
-    free = np.setdiff1d(np.arange(count), sure, assume_unique=True)
+    free = np.flatnonzero(~sure)
     start, end = np.repeat(free, neighbors), near[free].ravel()
     low, high = np.divmod(
         np.unique(np.minimum(start, end) * np.int64(count) + np.maximum(start, end)), count
@@ -210,7 +208,7 @@ def _carried(
     facing = np.einsum("ni,ni->n", normals[farthest], outward[farthest])
     signs[farthest] = np.where(facing < 0, -1.0, 1.0)
     # One more node is the parent of all roots; each other point follows its parent in the tree.
-    roots = np.concatenate([sure, farthest])
+    roots = np.concatenate([np.flatnonzero(sure), farthest])
     ends = np.concatenate([low, roots]), np.concatenate([high, np.full(len(roots), count)])
     costs = np.concatenate([cost, np.full(len(roots), _ROOT)])
     tree = scipy.sparse.csgraph.minimum_spanning_tree(
@@ -224,8 +222,7 @@ def _carried(
     while not (ahead == count).all():  # pointer doubling: as many rounds as its depth has bits
         signs *= signs[ahead]
         ahead = ahead[ahead]
-    is_free = np.isin(np.arange(count), free)
-    smooth = (agreement * signs[low] * signs[high] > _SMOOTH) & is_free[low] & is_free[high]
+    smooth = (agreement * signs[low] * signs[high] > _SMOOTH) & ~(sure[low] | sure[high])
     parts = _components(cost[smooth], low[smooth], high[smooth], count)
     order = np.argsort(parts, kind="stable")
     patches = np.split(order, np.flatnonzero(np.diff(parts[order])) + 1)

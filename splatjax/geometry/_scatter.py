@@ -155,7 +155,7 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
     """
     if not isinstance(count, Real) or count < 1:
         raise ValueError(f"count is {count!r}; at least one splat is needed")
-    areas = mesh.face_areas() if len(mesh.faces) else np.zeros(0)
+    areas = mesh.face_areas()
     if not areas.sum() > 0:
         raise ValueError(
             "the mesh has no area; it needs at least one triangle that is not degenerate"
@@ -169,20 +169,18 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     points = SurfacePoints(faces, np.stack([1 - u - v, u, v], axis=-1))
     points = points.take(morton_order(points.positions(mesh)))
-    if relaxations and count > 1:
-        beyond = faces_beyond(mesh)
-        spacing = float(np.sqrt(areas.sum() / count))
-        for _ in range(relaxations):
-            positions, normals = points.positions(mesh), points.normals(mesh)
-            *_, to_centroids = surface_cells(
-                positions,
-                normals,
-                mirror_images(mesh, beyond, positions, spacing),
-                neighbors=10,
-                directions=12,
-                limit=spacing,
-            )
-            points = _settle(mesh, beyond, points.faces, positions + 1.3 * to_centroids)
+    beyond, spacing = faces_beyond(mesh), float(np.sqrt(areas.sum() / count))
+    for _ in range(relaxations):
+        positions, normals = points.positions(mesh), points.normals(mesh)
+        *_, to_centroids = surface_cells(
+            positions,
+            normals,
+            mirror_images(mesh, beyond, positions, spacing),
+            neighbors=10,
+            directions=12,
+            limit=spacing,
+        )
+        points = _settle(mesh, beyond, points.faces, positions + 1.3 * to_centroids)
     return points.take(
         morton_order(points.positions(mesh).astype(np.float32))
     )  # the order in single precision
@@ -222,13 +220,12 @@ def mirror_images(
 
 def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Compute barycentric coordinates of the points' projections to the planes of their faces."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
-    vectors = np.stack([b - a, c - a, points - a])
-    (d00, d01, d20), (_, d11, d21), _ = np.einsum("ani,bni->abn", vectors, vectors)
-    determinant = np.maximum(d00 * d11 - d01 * d01, 1e-30)
-    v = (d11 * d20 - d01 * d21) / determinant
-    w = (d00 * d21 - d01 * d20) / determinant
-    return np.stack([1 - v - w, v, w], axis=-1)
+    corners = mesh.vertices[mesh.faces[faces]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    squared = np.maximum(np.einsum("ni,ni->n", normals, normals), 1e-30)
+    rays = corners - points[:, None]
+    opposite = np.cross(np.roll(rays, -1, axis=1), np.roll(rays, -2, axis=1))
+    return np.einsum("nci,ni->nc", opposite, normals) / squared[:, None]
 
 
 def _settle(mesh: Mesh, beyond: np.ndarray, faces: np.ndarray, points: np.ndarray) -> SurfacePoints:

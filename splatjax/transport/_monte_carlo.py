@@ -13,9 +13,7 @@ from splatjax.scattering import Film, Layer, check_stack
 
 from ._results import MonteCarlo, assemble
 from ._rounds import Walk, finish
-from ._walk import AbstractIncidence, NormalIncidence, Stack
-
-_FLIGHTS = 20_000
+from ._walk import AbstractIncidence, LayeredMedia, NormalIncidence
 
 # Number of simultaneous photons: their state stays in the cache of a core or two, and few lanes
 # wait for the last photon.
@@ -25,70 +23,50 @@ _MOST_LANES, _LEAST_LANES, _PHOTONS_A_LANE = 16384, 1024, 8
 _FILM_THICKNESS = 1e-6
 
 
-class LayeredMedia(eqx.Module):
-    r"""Layers, films among them, as arrays over all channels.
-
-    **Attributes:**
-
-    - `sigma_a`, `sigma_s`: 1/mm; a film does not scatter, and has its optical depth over its
-      thickness.
-    - `thickness`: mm.
-    - `eta`: indices relative to air, those of the neighbors above and below included.
-    - `g`: mean cosines of the phase function.
-    - `first`: number of the uppermost layer that scatters.
+def _lay_out(
+    layers: Sequence[Layer | Film],
+    g: Float[Array, " layers"],
+    eta_above: Float[Array, "*channels"],
+    eta_below: Float[Array, "*channels"],
+) -> LayeredMedia:
+    """Convert layers, from the top. A film has the index of the next scattering layer below it,
+    or else of the last one above.
     """
+    scattering = [layer for layer in layers if isinstance(layer, Layer)]
+    like = scattering[0].medium.sigma_a
+    thin = _FILM_THICKNESS / jax.lax.stop_gradient(scattering[0].medium.sigma_s_prime)
+    rows = []
+    for number, layer in enumerate(layers):
+        lower = [candidate for candidate in layers[number:] if isinstance(candidate, Layer)]
+        medium = (lower or scattering[-1:])[0].medium
+        if isinstance(layer, Film):
+            rows.append((layer.optical_depth / thin, jnp.zeros_like(like), thin, medium.eta))
+        else:
+            sigma_s = medium.sigma_s_prime / (1 - g[number])
+            thickness = jnp.broadcast_to(layer.thickness, like.shape)
+            rows.append((medium.sigma_a, sigma_s, thickness, medium.eta))
+    sigma_a, sigma_s, thickness, eta = (jnp.stack(column) for column in zip(*rows, strict=True))
+    above, below = (jnp.broadcast_to(edge, (1, len(like))) for edge in (eta_above, eta_below))
+    first = next(number for number, layer in enumerate(layers) if isinstance(layer, Layer))
+    eta = jnp.concatenate([above, eta, below])
+    return LayeredMedia(sigma_a, sigma_s, thickness, eta, g, first)
 
-    sigma_a: Float[Array, "layers channels"]
-    sigma_s: Float[Array, "layers channels"]
-    thickness: Float[Array, "layers channels"]
-    eta: Float[Array, "layers_and_neighbors channels"]
-    g: Float[Array, " layers"]
-    first: int = eqx.field(static=True)
 
-    @classmethod
-    def of(
-        cls,
-        layers: Sequence[Layer | Film],
-        g: Float[Array, " layers"],
-        eta_above: Float[Array, "*channels"],
-        eta_below: Float[Array, "*channels"],
-    ) -> "LayeredMedia":
-        """Convert layers, from the top. A film has the index of the next scattering layer below it,
-        or else of the last one above.
-        """
-        scattering = [layer for layer in layers if isinstance(layer, Layer)]
-        like = scattering[0].medium.sigma_a
-        thin = _FILM_THICKNESS / jax.lax.stop_gradient(scattering[0].medium.sigma_s_prime)
-        rows = []
-        for number, layer in enumerate(layers):
-            lower = [candidate for candidate in layers[number:] if isinstance(candidate, Layer)]
-            medium = (lower or scattering[-1:])[0].medium
-            if isinstance(layer, Film):
-                rows.append((layer.optical_depth / thin, jnp.zeros_like(like), thin, medium.eta))
-            else:
-                sigma_s = medium.sigma_s_prime / (1 - g[number])
-                thickness = jnp.broadcast_to(layer.thickness, like.shape)
-                rows.append((medium.sigma_a, sigma_s, thickness, medium.eta))
-        sigma_a, sigma_s, thickness, eta = (jnp.stack(column) for column in zip(*rows, strict=True))
-        above, below = (jnp.broadcast_to(edge, (1, len(like))) for edge in (eta_above, eta_below))
-        first = next(number for number, layer in enumerate(layers) if isinstance(layer, Layer))
-        return cls(sigma_a, sigma_s, thickness, jnp.concatenate([above, eta, below]), g, first)
+def _shared_walks(media: LayeredMedia) -> list[np.ndarray]:
+    """Group the channels, by number, that differ in absorption and in scale alone: they share a
+    walk.
 
-    def shared_walks(self) -> list[np.ndarray]:
-        """Group the channels, by number, that differ in absorption and in scale alone: they share a
-        walk.
-
-        Under `jit`, where values are unknown, each channel has its own walk.
-        """
-        geometry = jax.lax.stop_gradient((self.sigma_s, self.thickness, self.eta))
-        if is_traced(geometry):
-            return [np.asarray([channel]) for channel in range(self.sigma_a.shape[1])]
-        sigma_s, thickness, eta = (np.asarray(values) for values in geometry)
-        unit = 1 / sigma_s[self.first]
-        _, group = np.unique(
-            np.concatenate([sigma_s * unit, thickness / unit, eta]), axis=1, return_inverse=True
-        )
-        return [np.flatnonzero(group == number) for number in range(group.max() + 1)]
+    Under `jit`, where values are unknown, each channel has its own walk.
+    """
+    geometry = jax.lax.stop_gradient((media.sigma_s, media.thickness, media.eta))
+    if is_traced(geometry):
+        return [np.asarray([channel]) for channel in range(media.sigma_a.shape[1])]
+    sigma_s, thickness, eta = (np.asarray(values) for values in geometry)
+    unit = 1 / sigma_s[media.first]
+    _, group = np.unique(
+        np.concatenate([sigma_s * unit, thickness / unit, eta]), axis=1, return_inverse=True
+    )
+    return [np.flatnonzero(group == number) for number in range(group.max() + 1)]
 
 
 def monte_carlo(
@@ -101,7 +79,7 @@ def monte_carlo(
     g: Numbers = 0.0,
     eta_above: Numbers = 1.0,
     eta_below: Numbers = 1.0,
-    flights: int = _FLIGHTS,
+    flights: int = 20_000,
     progress: Callable[[int, int], None] | None = None,
 ) -> MonteCarlo:
     r"""Compute a profile by random walks of photons through layers: the reference for all other
@@ -159,9 +137,11 @@ def monte_carlo(
     media, edges = _prepare(layers, g, above, below, edges)
     check_values("the number of edges", len(edges), "at least 2", lambda x: x > 1)
     check_values("edges", edges, "at least 0 (mm)", lambda x: x >= 0)
-    steps = jnp.diff(edges)
     check_values(
-        "the steps of edges", steps, "positive (mm), with ascending edges", lambda x: x > 0
+        "the steps of edges",
+        jnp.diff(edges),
+        "positive (mm), with ascending edges",
+        lambda x: x > 0,
     )
     lanes = max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length())
     settings = {
@@ -170,7 +150,7 @@ def monte_carlo(
         "flights": jnp.asarray(flights, jnp.int32),
         "lanes": min(_MOST_LANES, lanes),
     }
-    groups, means = media.shared_walks(), []
+    groups, means = _shared_walks(media), []
     for number, group in enumerate(groups):
         channels = jnp.asarray(group.astype(np.int32))
         walk = _walk_of(media, jnp.asarray(number), channels, edges, key, **settings)
@@ -186,7 +166,7 @@ def monte_carlo(
 @eqx.filter_jit
 def _prepare(layers, g, eta_above, eta_below, edges):
     """Lay out the media, and, unless there are others, rings as far as light leaves."""
-    media = LayeredMedia.of(layers, jnp.broadcast_to(g, len(layers)), eta_above, eta_below)
+    media = _lay_out(layers, jnp.broadcast_to(g, len(layers)), eta_above, eta_below)
     if edges is not None:
         return media, edges
     top = jax.lax.stop_gradient(layers[media.first].medium)
@@ -206,11 +186,11 @@ def _mean_moments(walk: Walk, *, progress) -> Float[Array, "channels places two"
 @_mean_moments.def_jvp
 def _mean_moments_jvp(primals, tangents, *, progress):
     (walk,), (walk_dot,) = primals, tangents
-    stack_dot = walk_dot.stack
+    media, media_dot = walk.media, walk_dot.media
     for name, tangent in (
-        ("thickness", stack_dot.thickness),
-        ("eta", stack_dot.eta),
-        ("edges and g", (stack_dot.g, walk_dot.edges, walk_dot.incidence)),
+        ("thickness", media_dot.thickness),
+        ("eta", media_dot.eta),
+        ("edges and g", (media_dot.g, walk_dot.edges, walk_dot.incidence)),
     ):
         if jax.tree.leaves(tangent):
             raise ValueError(
@@ -219,8 +199,8 @@ def _mean_moments_jvp(primals, tangents, *, progress):
                 "the same key"
             )
     moments = finish(walk, True, progress)
-    none = jnp.zeros_like(walk.sigma_a)
-    along = [none if dot is None else dot for dot in (walk_dot.sigma_a, walk_dot.sigma_s)]
+    none = jnp.zeros_like(media.sigma_a)
+    along = [none if dot is None else dot for dot in (media_dot.sigma_a, media_dot.sigma_s)]
     slope = jnp.einsum("crp,pc->cr", moments[..., 2:], jnp.concatenate(along))
     return moments[..., :2], jnp.stack([slope, jnp.zeros_like(slope)], axis=-1)
 
@@ -234,21 +214,16 @@ def _walk_of(
     key: Key[Array, ""],
     **settings,
 ) -> Walk:
-    """Set up the walk of a group of channels, in the free paths of the first of them."""
-    first = group[0]
+    """Set up the walk of a group of channels, each in its free paths."""
     # The unit of length: the free path between scatterings in the first layer that scatters, mm.
     unit = jax.lax.stop_gradient(1 / media.sigma_s[media.first, group])
-    sigma_a, sigma_s = (values[:, group] * unit[None] for values in (media.sigma_a, media.sigma_s))
-    return Walk(
-        stack=Stack(
-            jax.lax.stop_gradient(sigma_s[:, 0]),
-            media.thickness[:, first] / unit[0],
-            media.eta[:, first],
-            media.g,
-        ),
-        sigma_a=sigma_a,
-        sigma_s=sigma_s,
-        edges=edges[None] / unit[:, None],
-        key=jax.random.fold_in(key, number),
-        **settings,
+    in_free_paths = LayeredMedia(
+        media.sigma_a[:, group] * unit[None],
+        media.sigma_s[:, group] * unit[None],
+        media.thickness[:, group] / unit[None],
+        media.eta[:, group],
+        media.g,
+        media.first,
     )
+    key = jax.random.fold_in(key, number)
+    return Walk(media=in_free_paths, edges=edges[None] / unit[:, None], key=key, **settings)

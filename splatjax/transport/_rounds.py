@@ -18,9 +18,9 @@ from ._walk import (
     IDLE,
     INSIDE,
     AbstractIncidence,
+    LayeredMedia,
     PathWeights,
     Photons,
-    Stack,
     fly,
     weigh,
 )
@@ -40,21 +40,18 @@ _LEAST, _SURVIVING = 1e-4, 0.1
 
 
 class Walk(eqx.Module):
-    r"""The constants of a walk, in free paths of the stack.
+    r"""The constants of a walk, in free paths.
 
     **Attributes:**
 
-    - `stack`: the layers, by which photons fly.
-    - `sigma_a`, `sigma_s`: coefficients of the channels that walk along. Differentiable.
+    - `media`: of the channels that walk along. Differentiable in `sigma_a` and `sigma_s`.
     - `edges`: of the rings, for each channel.
     - `key`: of this walk.
     - `photons`, `flights`: numbers of photons and of their flights. They are traced, so that they
       need no program of their own.
     """
 
-    stack: Stack
-    sigma_a: Float[Array, "layers channels"]
-    sigma_s: Float[Array, "layers channels"]
+    media: LayeredMedia
     edges: Float[Array, "channels edges"]
     key: Key[Array, ""]
     incidence: AbstractIncidence
@@ -101,7 +98,7 @@ def finish(
 
 @eqx.filter_jit
 def _start(walk: Walk, with_slopes: bool) -> _State:
-    dtype, (layers, channels) = walk.edges.dtype, walk.sigma_a.shape
+    dtype, (layers, channels) = walk.edges.dtype, walk.media.sigma_a.shape
     parameters, rings = 2 * layers * with_slopes, walk.edges.shape[1] - 1
     zero, number = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
     photons = Photons(zero, zero, zero, (zero, zero, zero + 1), zero, number, number + IDLE, number)
@@ -132,16 +129,16 @@ def _round(walk: Walk, state: _State) -> _State:
         def flight(number, carry):
             photons, weights = carry
             xi = uniforms(walk.key, draws + number, walk.lanes, weights.carried.dtype)
-            moved, *flown = fly(walk.stack, photons, xi)
+            moved, *flown = fly(walk.media, photons, xi)
             return moved, weigh(sigma_a, sigma_s, weights, photons.layer, *flown)
 
         photons, weights = jax.lax.fori_loop(0, _FLIGHTS, flight, (state.photons, weights))
         return weights, photons
 
-    start, slopes = (walk.sigma_a, walk.sigma_s, state.weights), state.slopes
+    start, slopes = (walk.media.sigma_a, walk.media.sigma_s, state.weights), state.slopes
     parameters = len(slopes.carried)
     if parameters:
-        layers, channels = walk.sigma_a.shape
+        layers, channels = walk.media.sigma_a.shape
         steps = jnp.eye(parameters, dtype=walk.edges.dtype).reshape(parameters, 2, layers, 1)
         steps = jnp.broadcast_to(steps, (parameters, 2, layers, channels))
 
@@ -179,7 +176,7 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
     begins = free & (state.started + turn <= walk.photons)
     xi = uniforms(walk.key, state.round * (_FLIGHTS + 2) + _FLIGHTS + 1, walk.lanes, dtype)
     spread = evenly(walk.key, state.started + turn, dtype)
-    direction, weight = walk.incidence.enter(spread, xi[1], walk.stack.eta[:2])
+    direction, weight = walk.incidence.enter(spread, xi[1], walk.media.eta[:2, 0])
 
     zero, number = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
     place = jnp.where(begins, INSIDE, IDLE)

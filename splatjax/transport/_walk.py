@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._smooth import mean_decay
-from splatjax.scattering import moment_outside, reflectance
+from splatjax.scattering import ExactFresnel, reflectance
 
 _SINE = [(-1) ** n * math.pi ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(8)]
 _COSINE = [(-1) ** n * math.pi ** (2 * n) / math.factorial(2 * n) for n in range(9)]
@@ -68,7 +68,7 @@ class DiffuseIncidence(AbstractIncidence):
 
     def reflected(self, eta):
         """Compute twice the integral of `mu F(mu)` over the cosine outside."""
-        return jnp.where(eta < 1, 1 - (1 - moment_outside(eta)) * eta * eta, moment_outside(eta))
+        return ExactFresnel().first_moment(1 / eta)
 
 
 def fresnel(
@@ -125,26 +125,32 @@ def of_layer(
 INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
 
 
-class Stack(eqx.Module):
-    r"""The geometry of a walk, in free paths of the first layer that scatters. A constant of every
-    derivative.
+class LayeredMedia(eqx.Module):
+    r"""Layers, films among them, as arrays over channels, from the top.
 
     **Attributes:**
 
-    - `sigma_s`: scattering coefficients; 0 in a film.
-    - `thickness`: of each layer.
+    - `sigma_a`, `sigma_s`: 1/mm; a film does not scatter, and has its optical depth over its
+      thickness.
+    - `thickness`: mm.
     - `eta`: indices relative to air, those of the neighbors above and below included.
     - `g`: mean cosines of the phase function.
+    - `first`: number of the uppermost layer that scatters.
+
+    In a walk, lengths are in the free paths between scatterings in that layer, so that all its
+    channels have one geometry.
     """
 
-    sigma_s: Float[Array, " layers"]
-    thickness: Float[Array, " layers"]
-    eta: Float[Array, " layers_and_neighbors"]
+    sigma_a: Float[Array, "layers channels"]
+    sigma_s: Float[Array, "layers channels"]
+    thickness: Float[Array, "layers channels"]
+    eta: Float[Array, "layers_and_neighbors channels"]
     g: Float[Array, " layers"]
+    first: int = eqx.field(static=True)
 
 
 class Photons(eqx.Module):
-    """Positions of photons, in free paths of the stack; depth is from the top of their layer. Not
+    """Positions of photons, in free paths; depth is from the top of their layer. Not
     differentiated.
     """
 
@@ -208,7 +214,7 @@ def scatter(
 
 
 def fly(
-    stack: Stack, photons: Photons, xi: Float[Array, "four photons"]
+    media: LayeredMedia, photons: Photons, xi: Float[Array, "four photons"]
 ) -> tuple[Photons, Float[Array, " photons"], Bool[Array, " photons"]]:
     """Move photons by one flight. Uniform random numbers: cosine or reflection, angle, and the next
     free path. Also return its length in the layer where it began, 0 for a photon that does not fly,
@@ -216,7 +222,8 @@ def fly(
     """
     ux, uy, uz = photons.direction
     layer, inside = photons.layer, photons.place == INSIDE
-    sigma_s, thickness = of_layer(stack.sigma_s, layer), of_layer(stack.thickness, layer)
+    thicknesses, eta = media.thickness[:, 0], media.eta[:, 0]
+    sigma_s, thickness = of_layer(media.sigma_s[:, 0], layer), of_layer(thicknesses, layer)
     down = uz > 0
     vertical = jnp.where(down, thickness - photons.depth, photons.depth)
     to_interface = jnp.maximum(vertical, 0.0) / jnp.maximum(jnp.abs(uz), jnp.finfo(uz.dtype).tiny)
@@ -226,24 +233,24 @@ def fly(
     scattered = to_scatter < to_interface
     length = jnp.where(inside, jnp.minimum(to_scatter, to_interface), 0.0)
 
-    turned = scatter(photons.direction, of_layer(stack.g, layer), xi[0], xi[1])
+    turned = scatter(photons.direction, of_layer(media.g, layer), xi[0], xi[1])
     from_eta, to_eta = (
-        of_layer(stack.eta[1:-1], layer),
-        jnp.where(down, of_layer(stack.eta[2:], layer), of_layer(stack.eta[:-2], layer)),
+        of_layer(eta[1:-1], layer),
+        jnp.where(down, of_layer(eta[2:], layer), of_layer(eta[:-2], layer)),
     )
     reflectance, onward = fresnel(jnp.abs(uz), from_eta, to_eta)
     crosses = ~scattered & (xi[0] > reflectance)
     bent = jnp.where(crosses, from_eta / to_eta, 1.0)
     next_layer = jnp.where(crosses, layer + jnp.where(down, 1, -1), layer)
     next_place = jnp.where(
-        next_layer < 0, ABOVE, jnp.where(next_layer >= stack.sigma_s.shape[0], BELOW, INSIDE)
+        next_layer < 0, ABOVE, jnp.where(next_layer >= len(thicknesses), BELOW, INSIDE)
     )
     stays = next_place == INSIDE
     up_again = jnp.where(crosses, jnp.where(down, onward, -onward), -uz)
     # At an interface the depth is 0 or that of the layer now entered, or met from inside, exactly.
     arrives_on_top = jnp.where(crosses, down, ~down)
     at_interface = jnp.where(
-        arrives_on_top, 0.0, of_layer(stack.thickness, jnp.where(stays, next_layer, layer))
+        arrives_on_top, 0.0, of_layer(thicknesses, jnp.where(stays, next_layer, layer))
     )
 
     moved = Photons(
@@ -275,7 +282,7 @@ def weigh(
     scattered: Bool[Array, " photons"],
 ) -> PathWeights:
     """Update weights along a flight in a layer: absorption is its mean, not sampled. Differentiable
-    in the coefficients, per free path of the stack.
+    in the coefficients.
 
     The likelihood of a path under other scattering coefficients than those it was drawn by is a
     product over its flights and scatterings: its derivative is the path's share in that of every
