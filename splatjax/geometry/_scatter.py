@@ -220,12 +220,13 @@ def mirror_images(
 
 def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Compute barycentric coordinates of the points' projections to the planes of their faces."""
-    corners = mesh.vertices[mesh.faces[faces]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    squared = np.maximum(np.einsum("ni,ni->n", normals, normals), 1e-30)
-    rays = corners - points[:, None]
-    opposite = np.cross(np.roll(rays, -1, axis=1), np.roll(rays, -2, axis=1))
-    return np.einsum("nci,ni->nc", opposite, normals) / squared[:, None]
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
+    vectors = np.stack([b - a, c - a, points - a])
+    (d00, d01, d20), (_, d11, d21), _ = np.einsum("ani,bni->abn", vectors, vectors)
+    determinant = np.maximum(d00 * d11 - d01 * d01, 1e-30)
+    v = (d11 * d20 - d01 * d21) / determinant
+    w = (d00 * d21 - d01 * d20) / determinant
+    return np.stack([1 - v - w, v, w], axis=-1)
 
 
 def _settle(mesh: Mesh, beyond: np.ndarray, faces: np.ndarray, points: np.ndarray) -> SurfacePoints:
