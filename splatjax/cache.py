@@ -23,7 +23,7 @@ from collections.abc import Callable, Generator, Hashable
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import NoneType
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -34,9 +34,7 @@ from jax.experimental.serialize_executable import deserialize_and_load, serializ
 from jax.tree_util import PyTreeDef
 
 from splatjax._library import profiles_folder
-from splatjax._precision import full_precision
-
-Function = TypeVar("Function", bound=Callable)
+from splatjax._precision import Function, full_precision
 
 _LARGEST = 1 << 30  # bytes in the folder, beyond which what was not used for longest is deleted
 _EFFECTLESS = re.compile("cache|log|platform")  # settings of JAX that no result depends on
