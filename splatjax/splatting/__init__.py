@@ -47,5 +47,6 @@ from ._surfaces import (
     visible_surfaces as visible_surfaces,
     VisibleSurfaces as VisibleSurfaces,
 )
-from ._sweeps import PartSweep as PartSweep, sum_parts as sum_parts
+from ._fragments import PartSweep as PartSweep
+from ._sweeps import sum_parts as sum_parts
 from ._tiles import TilePlan as TilePlan, TileRasterizer as TileRasterizer

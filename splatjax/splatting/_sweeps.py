@@ -27,8 +27,8 @@ from splatjax._combination import AbstractCombination
 from splatjax._precision import full_precision
 
 from ._bins import Bins
-from ._fragments import NUMBERS, Lanes, Listed, Sweep, second_limits
-from ._grid import TILE_SIDE
+from ._fragments import NUMBERS, PartSweep, SweepSettings
+from ._grid import TILE_SIDE, TileGrid
 from ._rasterizer import FragmentSums, PixelSums, SurfaceCapacity
 
 
@@ -40,56 +40,50 @@ class Spans(eqx.Module):
 
     - `tiles`: the tile at each place; the number of tiles in an empty place.
     - `far_limit`, `near_limit`: nearness. `far_limit` is inf without fragments.
-    - `needed`: places needed over planned.
     """
 
     tiles: Int[Array, " places"]
     far_limit: Float[Array, "places pixels"]
     near_limit: Float[Array, "places pixels"]
-    needed: Float[Array, ""]
 
     @classmethod
     def front(
-        cls, limits: Float[Array, "tiles pixels"], lengths: Int[Array, " tiles"], size: int
-    ) -> "Spans":
-        """Choose the places of the front. Longer lists come first, so that tiles that are swept
-        together have lists of similar length.
+        cls,
+        limits: Float[Array, "tiles pixels"],
+        lengths: Int[Array, " tiles"],
+        grid: TileGrid,
+        size: int,
+    ) -> tuple["Spans", Float[Array, ""]]:
+        """Choose the places of the front, and compute the places needed over planned. Longer lists
+        come first, so that tiles that are swept together have lists of similar length.
         """
         order = jnp.argsort(-lengths)
         shown = jnp.any(limits > -jnp.inf, axis=1)
-        tiles = _taken(order.astype(jnp.int32), list_chosen(shown[order], size), len(order))
-        far_limit = _taken(limits, tiles, jnp.inf)
-        far_limit = jnp.where(far_limit > -jnp.inf, far_limit, jnp.inf)
+        tiles = _taken(order.astype(jnp.int32), list_chosen(shown[order], size), grid.count)
+        far_limit = _taken(limits, tiles, -jnp.inf)
+        exists = far_limit > -jnp.inf
+        if grid.width % TILE_SIDE or grid.height % TILE_SIDE:
+            exists &= grid.within_picture(tiles)
+        far_limit = jnp.where(exists, far_limit, jnp.inf)
         needed = needed_over_planned(jnp.sum(shown), size).astype(limits.dtype)
-        return cls(tiles, far_limit, jnp.full_like(far_limit, jnp.inf), needed)
+        return cls(tiles, far_limit, jnp.full_like(far_limit, jnp.inf)), needed
 
     def opened(self, is_open: Bool[Array, "places pixels"], size: int, none: int):
         """Choose the places with pixels that the front leaves open.
 
-        Returns their tiles, the near limit of the surface behind, the same in open pixels and -inf
-        in others, and the places needed over planned.
+        Returns their tiles, the near limit of the surface behind, -inf in other pixels, and the
+        places needed over planned.
         """
-        is_open &= self.far_limit < jnp.inf
-        chosen = jnp.any(is_open, axis=1)
+        near_limit = jnp.where(is_open & (self.far_limit < jnp.inf), self.far_limit, -jnp.inf)
+        chosen = jnp.any(near_limit > -jnp.inf, axis=1)
         listed = list_chosen(chosen, size)
-        near_limit = _taken(self.far_limit, listed, -jnp.inf)
-        open_limit = jnp.where(_taken(is_open, listed, False), near_limit, -jnp.inf)
         needed = needed_over_planned(jnp.sum(chosen), size).astype(near_limit.dtype)
-        return _taken(self.tiles, listed, none), near_limit, open_limit, needed
-
-    def followed_by(self, behind: "Spans") -> "Spans":
-        """Append the places of the surface behind."""
-        return Spans(
-            tiles=jnp.concatenate([self.tiles, behind.tiles]),
-            far_limit=jnp.concatenate([self.far_limit, behind.far_limit]),
-            near_limit=jnp.concatenate([self.near_limit, behind.near_limit]),
-            needed=jnp.maximum(self.needed, behind.needed),
-        )
+        return _taken(self.tiles, listed, none), _taken(near_limit, listed, -jnp.inf), needed
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
 def sum_tile_fragments(
-    sweep: Sweep,
+    settings: SweepSettings,
     capacity: SurfaceCapacity,
     combination: AbstractCombination,
     hidden_from: Float[Array, ""],
@@ -100,105 +94,31 @@ def sum_tile_fragments(
 ) -> FragmentSums:
     """Sum attributes over the splats of every tile: this device's part of the sums."""
     listed = hidden_from, bins, shift, numbers, attributes
-    return _sum_fwd(sweep, capacity, combination, *listed)[0]
+    return _sum_fwd(settings, capacity, combination, *listed)[0]
 
 
-def _sum_fwd(sweep, capacity, combination, *listed):
-    part = PartSweep(sweep, Listed.of(*listed))
+def _sum_fwd(settings, capacity, combination, *listed):
+    part = PartSweep.of(settings, *listed)
     ((sums, spans),) = sum_parts(lambda: [[part]], [capacity], combination)
     return sums, (part, spans)
 
 
 @full_precision
-def _sum_bwd(sweep: Sweep, capacity: SurfaceCapacity, combination, residuals, cotangent):
+def _sum_bwd(settings, capacity, combination, residuals, cotangent):
     (part, spans), cotangent = residuals, cotangent.sums
-    listed = part.listed
 
     def add(_, *arguments):
-        return sweep.add_cotangents(listed, *arguments)
+        return part.add_cotangents(*arguments)
 
-    fields, attributes = len(NUMBERS), listed.attributes.shape[1]
-    shape = len(listed.numbers), fields + attributes
-    gradients = zeros_after(cotangent, shape, listed.numbers.dtype)
+    fields, attributes = len(NUMBERS), part.attributes.shape[1]
+    shape = len(part.numbers), fields + attributes
+    gradients = zeros_after(cotangent, shape, part.numbers.dtype)
     rows = spans.far_limit, spans.near_limit, cotangent
-    planes = materialized(part.each_round(spans.tiles, rows, add, gradients).T)[:, :-1]
+    planes = materialized(_each_round(part, spans.tiles, rows, add, gradients).T)[:, :-1]
     return None, None, None, tuple(planes[:fields]), planes[fields:]
 
 
 sum_tile_fragments.defvjp(_sum_fwd, _sum_bwd)
-
-
-class PartSweep(eqx.Module):
-    """The separate stages of the sweep, for splats that may be one of several parts: splats of
-    another part may be in front.
-    """
-
-    sweep: Sweep
-    listed: Listed
-
-    @jit_unless_traced
-    def limits(self) -> tuple[Float[Array, "tiles pixels"], Int[Array, " tiles"]]:
-        """Compute the end of the front, -inf without one; and the blocks of each list."""
-        grid, bins, dtype = self.sweep.grid, self.listed.bins, self.listed.numbers.dtype
-
-        def look(_, lanes: Lanes, limits):
-            new = self.sweep.limits(self.listed, lanes)
-            return limits.at[lanes.tiles].set(new, mode="drop")
-
-        limits = zeros_after(self.listed.numbers, (grid.count, TILE_SIDE**2), dtype) - jnp.inf
-        listed = jnp.where(bins.counts[bins.order] > 0, bins.order, grid.count)
-        return self.each_round(listed, (), look, limits), grid.blocks(bins.counts[: grid.count])
-
-    def empty_sums(self, front: Spans, capacity: SurfaceCapacity) -> PixelSums:
-        """Return sums over no fragments, for the places of both surfaces."""
-        places, attributes = capacity.front + capacity.behind, self.listed.attributes
-        inputs, dtype = (front.far_limit, attributes), front.far_limit.dtype
-        rows = zeros_after(inputs, (places, attributes.shape[1] + 1, TILE_SIDE**2), dtype)
-        return PixelSums(rows, zeros_after(inputs, (places, TILE_SIDE**2), dtype))
-
-    @jit_unless_traced
-    def add_sums(self, spans: Spans, so_far: PixelSums, first: int) -> PixelSums:
-        """Add the sums over the fragments of some spans to others, from a first place on."""
-
-        def add(i, lanes: Lanes, far_limit, near_limit, tiles, so_far):
-            sums = self.sweep.within_picture(
-                self.sweep.sums(self.listed, lanes, far_limit, near_limit), tiles
-            )
-            before = _sliced(so_far, first + i, len(tiles))
-            return _write(so_far, jax.tree.map(jnp.add, before, sums), first + i)
-
-        rows = spans.far_limit, spans.near_limit, spans.tiles
-        return self.each_round(spans.tiles, rows, add, so_far)
-
-    @jit_unless_traced
-    def limits_behind(
-        self, tiles: Int[Array, " places"], open_limit: Float[Array, "places pixels"]
-    ) -> tuple[Float[Array, "places pixels"], Float[Array, "places pixels"]]:
-        """Compute the end of the surface behind, for the fragments of sufficient weight and for
-        all; `open_limit` is the end of the front in open pixels, and -inf in others.
-        """
-
-        def look(i, lanes: Lanes, open_limit, limits):
-            return _write(limits, self.sweep.limits_behind(self.listed, lanes, open_limit), i)
-
-        none = zeros_after(open_limit, open_limit.shape, open_limit.dtype) - jnp.inf
-        return self.each_round(tiles, (open_limit,), look, (none, none))
-
-    def each_round(self, tiles: Int[Array, " places"], rows, function: Callable, out):
-        """Apply `function(first place, lanes, *rows, out)` to the places, as many at a time as
-        there are lanes, up to the last tile.
-        """
-        grid, bins, dtype = self.sweep.grid, self.listed.bins, self.listed.numbers.dtype
-
-        def step(i, out):
-            first = i * grid.lanes
-            chunk, *arguments = _sliced((tiles, *rows), first, grid.lanes)
-            return function(first, self.sweep.lanes(bins, chunk, dtype), *arguments, out)
-
-        ends = jnp.arange(1, len(tiles) + 1, dtype=jnp.int32)
-        last = jnp.max(jnp.where(tiles < grid.count, ends, 0), initial=0)
-        rounds, _ = divided(last + (grid.lanes - 1), grid.lanes)
-        return jax.lax.fori_loop(jnp.zeros_like(rounds), rounds, step, out)
 
 
 def sum_parts(
@@ -217,44 +137,119 @@ def sum_parts(
     """
     first, views = next(iter(parts())), range(len(capacities))  # by their numbers
     # Stage 1: the end of the front over all parts.
-    limits = combination.largest([sweep.limits() for sweep in part] for part in parts())
-    fronts = [Spans.front(*limits[k], capacities[k].front) for k in views]
+    limits = combination.largest([_front_limits(sweep) for sweep in part] for part in parts())
+    fronts, front_needed = zip(
+        *(Spans.front(*limits[k], first[k].grid, capacities[k].front) for k in views), strict=True
+    )
 
     # Stage 2: the sums of the front.
     def add_front(sums, part):
-        return [part[k].add_sums(fronts[k], sums[k], 0) for k in views]
+        return [_add_sums(part[k], fronts[k], sums[k], 0) for k in views]
 
-    empty_sums = [first[k].empty_sums(fronts[k], capacities[k]) for k in views]
-    sums = combination.fold(add_front, empty_sums, parts())
+    sums = [_empty_sums(first[k], fronts[k], capacities[k]) for k in views]
+    sums = combination.fold(add_front, sums, parts())
     # Stage 3: the end of the surface behind, in pixels that the front leaves open.
     weights = combination.total([[sums[k].weights[: capacities[k].front] for k in views]])
-    opened = []
-    for k, capacity in enumerate(capacities):
-        sweep = first[k].sweep
-        is_open = weights[k] < first[k].listed.hidden_from
-        opened.append(fronts[k].opened(is_open, capacity.behind, sweep.grid.count))
-    tiles, near_limits, open_limits, needed = zip(*opened, strict=True)
+    is_open = [weights[k] < first[k].hidden_from for k in views]
+    tiles, near_limits, behind_needed = zip(
+        *(fronts[k].opened(is_open[k], capacities[k].behind, first[k].grid.count) for k in views),
+        strict=True,
+    )
     limits = combination.largest(
-        [part[k].limits_behind(tiles[k], open_limits[k]) for k in views] for part in parts()
+        [_limits_behind(part[k], tiles[k], near_limits[k]) for k in views] for part in parts()
     )
 
     # Stage 4: the sums of the surface behind.
-    far_limits = [second_limits(*limits[k]) for k in views]
-    behind = [Spans(*span) for span in zip(tiles, far_limits, near_limits, needed, strict=True)]
+    behind = [Spans(tiles[k], _second_limits(*limits[k]), near_limits[k]) for k in views]
 
     def add_behind(sums, part):
-        return [part[k].add_sums(behind[k], sums[k], capacities[k].front) for k in views]
+        return [_add_sums(part[k], behind[k], sums[k], capacities[k].front) for k in views]
 
     sums = combination.fold(add_behind, sums, parts())
     results = []
     for k, capacity in enumerate(capacities):
-        spans = fronts[k].followed_by(behind[k])
+        spans = jax.tree.map(lambda *pair: jnp.concatenate(pair), fronts[k], behind[k])
         # Only of the first part: a device has one, or it streams parts for which the capacity of
         # the lists was planned.
-        lists = first[k].listed.bins.needed.astype(spans.needed.dtype)
-        needed = combination.largest([jnp.maximum(spans.needed, lists)])
+        lists = first[k].bins.needed.astype(front_needed[k].dtype)
+        needed = jnp.stack([front_needed[k], behind_needed[k], lists])
+        needed = combination.largest([jnp.max(needed)])
         results.append((FragmentSums(spans.tiles, sums[k], needed, capacity.front), spans))
     return results
+
+
+@jit_unless_traced
+def _front_limits(part: PartSweep) -> tuple[Float[Array, "tiles pixels"], Int[Array, " tiles"]]:
+    """Compute the end of the front, -inf without one; and the blocks of each list."""
+    grid, bins = part.grid, part.bins
+
+    def look(_, lanes, limits):
+        return limits.at[lanes].set(part.front_limits(lanes), mode="drop")
+
+    shape = grid.count, TILE_SIDE**2
+    limits = zeros_after(part.numbers, shape, part.numbers.dtype) - jnp.inf
+    listed = jnp.where(bins.counts[bins.order] > 0, bins.order, grid.count)
+    return _each_round(part, listed, (), look, limits), grid.blocks(bins.counts[: grid.count])
+
+
+def _empty_sums(part: PartSweep, front: Spans, capacity: SurfaceCapacity) -> PixelSums:
+    """Return sums over no fragments, for the places of both surfaces."""
+    places, inputs = capacity.front + capacity.behind, (front.far_limit, part.attributes)
+    shape, dtype = (part.attributes.shape[1] + 1, TILE_SIDE**2), front.far_limit.dtype
+    rows = zeros_after(inputs, (places, *shape), dtype)
+    return PixelSums(rows, zeros_after(inputs, (places, TILE_SIDE**2), dtype))
+
+
+@jit_unless_traced
+def _add_sums(part: PartSweep, spans: Spans, so_far: PixelSums, first: int) -> PixelSums:
+    """Add the sums over the fragments of some spans to others, from a first place on."""
+
+    def add(i, lanes, far_limit, near_limit, so_far):
+        before = _sliced(so_far, first + i, len(lanes))
+        sums = jax.tree.map(jnp.add, before, part.sums(lanes, far_limit, near_limit))
+        return _write(so_far, sums, first + i)
+
+    return _each_round(part, spans.tiles, (spans.far_limit, spans.near_limit), add, so_far)
+
+
+@jit_unless_traced
+def _limits_behind(
+    part: PartSweep, tiles: Int[Array, " places"], near_limit: Float[Array, "places pixels"]
+) -> tuple[Float[Array, "places pixels"], Float[Array, "places pixels"]]:
+    """Compute the end of the surface behind, for the fragments of sufficient weight and for all."""
+
+    def look(i, lanes, near_limit, limits):
+        return _write(limits, part.limits_behind(lanes, near_limit), i)
+
+    none = zeros_after(near_limit, near_limit.shape, near_limit.dtype) - jnp.inf
+    return _each_round(part, tiles, (near_limit,), look, (none, none))
+
+
+def _second_limits(
+    weighty: Float[Array, "places pixels"], of_any: Float[Array, "places pixels"]
+) -> Float[Array, "places pixels"]:
+    """Choose the end of the surface behind from the two largest limits over all parts; inf without
+    a surface.
+    """
+    limits = jnp.where(weighty > -jnp.inf, weighty, of_any)
+    return jnp.where(limits > -jnp.inf, limits, jnp.inf)
+
+
+def _each_round(part: PartSweep, tiles: Int[Array, " places"], rows, function: Callable, out):
+    """Apply `function(first place, lanes, *rows, out)` to the places, as many at a time as there
+    are lanes, up to the last tile.
+    """
+    grid = part.grid
+
+    def step(i, out):
+        first = i * grid.lanes
+        lanes, *arguments = _sliced((tiles, *rows), first, grid.lanes)
+        return function(first, lanes, *arguments, out)
+
+    ends = jnp.arange(1, len(tiles) + 1, dtype=jnp.int32)
+    last = jnp.max(jnp.where(tiles < grid.count, ends, 0), initial=0)
+    rounds, _ = divided(last + (grid.lanes - 1), grid.lanes)
+    return jax.lax.fori_loop(jnp.zeros_like(rounds), rounds, step, out)
 
 
 def _taken(array: Array, places: Int[Array, " places"], fill) -> Array:

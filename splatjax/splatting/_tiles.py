@@ -23,10 +23,10 @@ from splatjax.cache import reuse_capacity
 from splatjax.scene import Splats
 
 from ._bins import BinCapacity, bin_items
-from ._fragments import NUMBERS, Listed, Sweep
+from ._fragments import NUMBERS, PartSweep
 from ._grid import TileGrid
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, SurfaceCapacity
-from ._sweeps import PartSweep, sum_tile_fragments
+from ._sweeps import sum_tile_fragments
 from ._views import AbstractView, SplattingSettings
 
 _STEP = 1024  # least step to which the planned number of splats is rounded up
@@ -147,8 +147,8 @@ class TilePlan(AbstractRasterPlan):
         settings: SplattingSettings,
         combination: AbstractCombination,
     ) -> FragmentSums:
-        sweep, *binned = self._bin(splats, attributes, view, settings)
-        return sum_tile_fragments(sweep, self.places, combination, *binned)
+        sweep_settings, *binned = self._bin(splats, attributes, view, settings)
+        return sum_tile_fragments(sweep_settings, self.places, combination, *binned)
 
     @full_precision
     @eqx.filter_jit
@@ -164,17 +164,14 @@ class TilePlan(AbstractRasterPlan):
         """
         chosen, _ = self.choose(splats, view)
         seen = splats.take(chosen), take_points(attributes, chosen)
-        sweep, *binned = self._bin(*seen, view, settings)
-        return PartSweep(sweep, Listed.of(*binned))
+        return PartSweep.of(*self._bin(*seen, view, settings))
 
     def _bin(self, splats: Splats, attributes, view: AbstractView, settings: SplattingSettings):
-        """Project the splats, and list them by tile. Returns the input of a sweep: its settings,
-        the weight sum that hides, the lists, and the shifts, numbers and attributes of the splats.
-        """
+        """Project the splats, and list them by tile. Returns the arguments of `PartSweep.of`."""
         grid = self.rasterizer.grid(view)
         footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
         return (
-            Sweep(type(view), grid, settings.filter_radius),
+            (type(view), grid, settings.filter_radius),
             settings.hidden_from.astype(splats.centers.dtype),
             bin_items(footprints.ranges(grid), grid, self.bins),
             jax.lax.stop_gradient(footprints.shift),
