@@ -126,21 +126,9 @@ class TileRanges(eqx.Module):
         """Count the items of every tile, from the corners of their rectangles."""
         touched = jnp.where(self.across * self.down > 0, 1, 0)
         corners = jnp.zeros((grid.down + 1, grid.across + 1), jnp.int32)
-        i0, j0 = jnp.minimum(self.left, grid.across), jnp.minimum(self.top, grid.down)
-        i1, j1 = (
-            jnp.minimum(self.left + self.across, grid.across),
-            jnp.minimum(self.top + self.down, grid.down),
-        )
-        corners = (
-            corners.at[j0, i0]
-            .add(touched)
-            .at[j1, i1]
-            .add(touched)
-            .at[j0, i1]
-            .add(-touched)
-            .at[j1, i0]
-            .add(-touched)
-        )
+        right, below = self.left + self.across, self.top + self.down
+        corners = corners.at[self.top, self.left].add(touched).at[below, right].add(touched)
+        corners = corners.at[self.top, right].add(-touched).at[below, self.left].add(-touched)
         counts = jnp.cumsum(jnp.cumsum(corners, axis=0), axis=1)[:-1, :-1].reshape(-1)
         return jnp.pad(counts, (0, grid.padded_count - counts.shape[0]))
 

@@ -5,6 +5,7 @@ between groups, by bundles of parallel lines.
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import map_chunks
 from splatjax._combination import AbstractCombination
-from splatjax._records import check_values
+from splatjax._records import record, valid
 from splatjax.scene import Splats, even_directions
 
 MERGED_COUNTS = 8, 16, 32  # consecutive splats that are near each other in the order of a plan
@@ -53,12 +54,7 @@ def merge_splats(splats: Splats, count: int) -> Splats:
         return Splats(center, normal, radius, area)
 
     front, back = of_side(is_front), of_side(~is_front)
-    return Splats(
-        *(
-            jnp.concatenate([getattr(side, name) for side in (front, back)])
-            for name in ("centers", "normals", "radii", "areas")
-        )
-    )
+    return jax.tree.map(lambda *sides: jnp.concatenate(sides), front, back)
 
 
 _MOST_GROUPS = 90_000
@@ -71,6 +67,7 @@ _LEAST_NORMAL = 1e-3  # length of the mean normal of a group
 _AT_ONCE = 1 << 19  # pairs of splat and direction
 
 
+@record
 class SightlineSettings(eqx.Module):
     r"""Settings of the visibility between splats. Static.
 
@@ -79,11 +76,11 @@ class SightlineSettings(eqx.Module):
     - `directions`: number of directions over the sphere, even; the same for all splats.
     """
 
-    directions: int = eqx.field(static=True, default=256)
-
-    def __check_init__(self):
-        expected = "an even number of 2 or more"
-        check_values("directions", self.directions, expected, lambda n: (n >= 2) & (n % 2 == 0))
+    directions: int = eqx.field(
+        static=True,
+        default=256,
+        metadata=valid("an even number of 2 or more", lambda n: (n >= 2) & (n % 2 == 0)),
+    )
 
 
 class Sightlines(eqx.Module):

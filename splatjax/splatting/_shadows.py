@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks, rounded_up
 from splatjax._combination import AbstractCombination, extreme
-from splatjax._records import check_values
+from splatjax._records import record, valid
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats, rotation_towards
 
@@ -27,6 +27,7 @@ _LEAST_RESOLUTION = 64
 _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 
 
+@record
 class ShadowSettings(eqx.Module):
     r"""Settings of shadow maps and of the comparison with them. All static.
 
@@ -55,20 +56,15 @@ class ShadowSettings(eqx.Module):
     bias: float = eqx.field(static=True, default=0.2)
     softness: float = eqx.field(static=True, default=0.4)
     largest_slope: float = eqx.field(static=True, default=8.0)
-    compared: int = eqx.field(static=True, default=3)
+    compared: int = eqx.field(
+        static=True, default=3, metadata=valid("2 or 3 (pixels)", lambda n: (n == 2) | (n == 3))
+    )
     merged_spacing: float = eqx.field(static=True, default=0.0)
-    pixels_per_spacing: float = eqx.field(static=True, default=4.0)
-
-    def __check_init__(self):
-        if self.compared not in (2, 3):
-            raise ValueError(f"ShadowSettings.compared is {self.compared}; give 2 or 3 pixels")
-        check_values(
-            "ShadowSettings.pixels_per_spacing",
-            self.pixels_per_spacing,
-            "positive; inf for the full resolution",
-            lambda x: x > 0,
-            finite=False,
-        )
+    pixels_per_spacing: float = eqx.field(
+        static=True,
+        default=4.0,
+        metadata=valid("positive; inf for the full resolution", lambda x: x > 0, finite=False),
+    )
 
     def for_spacing(self, spacing: float, bounds: "Bounds") -> "ShadowSettings":
         """Return the settings with the resolution for a spacing of the splats, mm. Not for traced

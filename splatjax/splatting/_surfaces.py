@@ -55,11 +55,7 @@ def coverages(
 
     **Arguments:** `front`, `behind`: sums of weights. Differentiable.
     """
-
-    def over(of_front, of_behind):
-        return of_front + (1 - of_front) * of_behind
-
-    is_open = grid.join(1 - over(coverage(front), coverage(behind))[:, None])
+    is_open = grid.join(((1 - coverage(front)) * (1 - coverage(behind)))[:, None])
     window = 1, 2 * _BESIDE + 1, 2 * _BESIDE + 1
     beside = jax.lax.reduce_window(is_open, -jnp.inf, jax.lax.max, window, (1, 1, 1), "SAME")
     closed = CLOSED + grid.cut(beside)[:, 0] * (full - CLOSED)
@@ -151,13 +147,9 @@ class VisibleSurfaces(eqx.Module):
 
     def gathered(self, combination: AbstractCombination) -> "VisibleSurfaces":
         """Return the places of all devices, without the rows of their sums."""
-
-        def of_places(surfaces):
-            return surfaces.tiles, surfaces.in_front, surfaces.share, surfaces.sums
-
-        *places, sums = of_places(self)
-        parts = combination.gather((*places, PixelSums(sums.rows[:, :0], sums.weights)))
-        return eqx.tree_at(of_places, self, parts)
+        sums = PixelSums(self.sums.rows[:, :0], self.sums.weights)
+        places = combination.gather((self.tiles, self.in_front, sums, self.share))
+        return VisibleSurfaces(self.view, *places, self.needed)
 
     def points(
         self, tiles: Int[Array, " some"], depth: Float[Array, "some pixels"]

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from splatjax._records import check_values
+from splatjax._records import record, valid
 from splatjax.scene import Splats
 
 from ._grid import TileGrid, TileRanges
@@ -33,6 +33,7 @@ _EVEN, _SCATTERED = (0.1, 0.75), (0.35, 0.11)
 _MEAN_WEIGHT = (1 - 13 * math.exp(-4)) / 4  # `fragment_weight` over a disc
 
 
+@record
 class SplattingSettings(eqx.Module):
     r"""Settings of the surface that splats form. Static, but for the last.
 
@@ -49,12 +50,9 @@ class SplattingSettings(eqx.Module):
     filter_radius: float = eqx.field(static=True, default=2**0.5)
     epsilon_z: float = eqx.field(static=True, default=1.5)
     largest_slope: float = eqx.field(static=True, default=3.0)
-    full_coverage: float | Float[Array, ""] | None = None
-
-    def __check_init__(self):
-        if self.full_coverage is not None:
-            name = "SplattingSettings.full_coverage"
-            check_values(name, self.full_coverage, "in (0, 1]", lambda x: (x > 0) & (x <= 1))
+    full_coverage: float | Float[Array, ""] | None = eqx.field(
+        default=None, metadata=valid("in (0, 1]", lambda x: (x > 0) & (x <= 1))
+    )
 
     @property
     def covered_from(self) -> float | Float[Array, ""]:
