@@ -122,25 +122,24 @@ class Sightlines(eqx.Module):
             np.concatenate([np.asarray(getattr(part, name)) for part in parts])
             for name in ("centers", "normals", "areas")
         )
-        exists = areas.reshape(-1, size).sum(axis=1) > 0
-        if not exists.any():
-            exists[:1] = True
-        areas = areas.reshape(-1, size)[exists]
+        areas = areas.reshape(-1, size)
         total = np.maximum(areas.sum(axis=1), np.finfo(areas.dtype).tiny)
         centers, normals = (
-            np.einsum("gs,gsi->gi", areas / total[:, None], rows.reshape(-1, size, 3)[exists])
+            np.einsum("gs,gsi->gi", areas / total[:, None], rows.reshape(-1, size, 3))
             for rows in (centers, normals)
         )
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), _LEAST_NORMAL)
-        spacing = np.sqrt(np.quantile(total, _SPARSE))
+        # Groups without area have no normal: they neither see nor are seen, wherever they are.
+        exists = areas.sum(axis=1) > 0
+        if not exists.any():
+            exists[:1] = True
+        centers = np.where(exists[:, None], centers - centers[exists].mean(axis=0), 0)
+        spacing = np.sqrt(np.quantile(total[exists], _SPARSE))
         count = settings.directions
         lines = even_directions(count)[: count // 2]
-        seen = np.full((count, len(exists)), len(exists), np.int32)
-        numbers = np.append(np.flatnonzero(exists), len(exists))
+        seen = np.empty((count, len(exists)), np.int32)
         for i, line in enumerate(lines):
-            ends = _ends(line, centers - centers.mean(axis=0), normals, spacing)
-            for j, seen_along in zip((i, i + count // 2), ends, strict=True):
-                seen[j, numbers[:-1]] = numbers[seen_along]
+            seen[i], seen[i + count // 2] = _ends(line, centers, normals, spacing)
         directions = np.concatenate([lines, -lines]).astype(centers.dtype)
         return cls(jnp.asarray(directions), jnp.asarray(seen.T), size)
 
@@ -206,13 +205,12 @@ def _ends(line, centers, normals, spacing):
         # From each position of the sequence on, the next splat that faces back.
         places = np.where(cosine < 0, np.arange(count), count)
         following = np.append(np.minimum.accumulate(places[::-1])[::-1], [count, count])
-        ends = np.full(count + 1, count)
+        cell_of_end = np.append(cell, -1)
+        ends = np.full(count, count)
         start = np.flatnonzero(cosine > 0)
         end = following[start + 1]
         for _ in range(_CANDIDATES):
-            inside = end < count
-            start, end = start[inside], end[inside]
-            inside = cell[start] == cell[end]
+            inside = cell[start] == cell_of_end[end]
             start, end = start[inside], end[inside]
             between = centers[end] - centers[start]
             above = np.minimum(
@@ -221,4 +219,4 @@ def _ends(line, centers, normals, spacing):
             clear = above > _CLEARANCE * spacing
             ends[order[start[clear]]] = order[end[clear]]
             start, end = start[~clear], following[end[~clear] + 1]
-        yield ends[:count]
+        yield ends
