@@ -100,11 +100,8 @@ def record(cls: Class) -> Class:
             is_many = isinstance(values[name], list | tuple)
             parts = tuple(values[name]) if is_tuple and is_many else (values[name],)
             for part in parts:
-                if not isinstance(part, kinds) and not _is_placeholder(part):
-                    expected = " or ".join(_call(kind) for kind in kinds)
-                    raise ValueError(
-                        f"{cls.__name__}.{name} must be {expected}; got {type(part).__name__}"
-                    )
+                if not _is_placeholder(part):
+                    check_class(f"{cls.__name__}.{name}", part, *kinds)
             values[name] = parts if is_tuple else parts[0]
             records += parts
         initialize(self, **(values | _converted(cls.__name__, axes, values, records)))
@@ -119,10 +116,11 @@ def record(cls: Class) -> Class:
     return cls
 
 
-def check_class(name: str, value: Any, kind: type) -> None:
-    """Raise `ValueError` for a value that is no record of a class."""
-    if not isinstance(value, kind):
-        raise ValueError(f"{name} must be {_call(kind)}; got {type(value).__name__}")
+def check_class(name: str, value: Any, *kinds: type) -> None:
+    """Raise `ValueError` for a value that is no record of one of some classes."""
+    if not isinstance(value, kinds):
+        expected = " or ".join(_call(kind) for kind in kinds)
+        raise ValueError(f"{name} must be {expected}; got {type(value).__name__}")
 
 
 def check_installed(use: str, module: str, package: str | None = None) -> None:
