@@ -3,6 +3,7 @@ reflection of the rough interface, the transmission of diffuse light, and the co
 """
 
 from collections.abc import Callable
+from itertools import compress
 
 import equinox as eqx
 import jax
@@ -165,23 +166,25 @@ def reflected_radiance(
     """
 
     def lobe(wi, specular=points.specular):
-        roughness = points.roughness
         return specular_lobe(
-            points.normals, wi, points.outgoing, f0=f0, specular=specular, roughness=roughness
+            points.normals,
+            wi,
+            points.outgoing,
+            f0=f0,
+            specular=specular,
+            roughness=points.roughness,
         )
 
-    pairs = list(zip(groups, points.visibility, strict=True))
-    with_lobes = [(group, visible) for group, visible in pairs if not group.highlights]
-    mirrored_lights = [(group, visible) for group, visible in pairs if group.highlights]
+    has_lobes = [not group.highlights for group in groups]
     radiance = sum_received(
         points.positions,
         points.normals,
-        [group for group, _ in with_lobes],
-        [visible for _, visible in with_lobes],
+        list(compress(groups, has_lobes)),
+        list(compress(points.visibility, has_lobes)),
         lambda wi, _: lobe(wi)[None],
         channels,
     )
-    if not mirrored_lights:
+    if all(has_lobes):
         return radiance
     one, cosine = jnp.ones_like(f0), _cosine(points.normals, points.outgoing)
     specular = jnp.broadcast_to(points.specular, cosine.shape)[None]
@@ -191,8 +194,8 @@ def reflected_radiance(
     def received(wi):
         return lobe(wi, one) * _cosine(points.normals, wi)
 
-    for group, visible in mirrored_lights:
-        for index, highlight in zip(group.distinct, group.highlights, strict=True):
+    for group, visible in zip(groups, points.visibility, strict=True):
+        for index, highlight in zip(group.distinct, group.highlights, strict=False):
             reflected = specular * highlight.reflected(
                 points.positions, mirrored, points.roughness, received, albedo
             )

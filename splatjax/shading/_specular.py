@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.polynomial.chebyshev import chebder, chebpts1, chebvander
 
 from splatjax._chunking import map_chunks
 
 ROUGHNESS_RANGE = (0.05, 1.0)
+_LOG_ROUGHNESS = np.log(ROUGHNESS_RANGE).tolist()
 _LEAST_HALF_COSINE = 1e-4  # of N.(L+V): below it the lobe's pole is cut
 
 # Chebyshev nodes in sqrt(mu) and in log m. The square root resolves the steep part at grazing
@@ -51,11 +53,6 @@ def grazing_reflectance(f0: Float[Array, "..."]) -> Float[Array, "..."]:
     return 1 - deficit * deficit * deficit
 
 
-def clamped_roughness(roughness: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Clamp the roughness to [0.05, 1], for lobe and albedo alike, with gradient 0 outside."""
-    return jnp.clip(roughness, *ROUGHNESS_RANGE)
-
-
 def specular_lobe(
     normal: Float[Array, "*#points 3"],
     wi: Float[Array, "*#points 3"],
@@ -79,7 +76,8 @@ def specular_lobe(
     - `normal`, `wi`, `wo`: unit vectors; `wi` and `wo` point away from the surface. Differentiable.
     - `f0`: reflectance at normal incidence (`fresnel_f0`). Differentiable.
     - `specular`: strength rho_s. Differentiable.
-    - `roughness`: root mean square slope m, clamped to [0.05, 1]. Differentiable.
+    - `roughness`: root mean square slope m, clamped to [0.05, 1] with gradient 0 outside.
+      Differentiable.
 
     **Returns:** 1/sr, at least 0, unchanged when `wi` and `wo` are exchanged. Where `N.wi <= 0` or
     `N.wo <= 0` value and gradient are 0. The pole where both directions graze the surface in
@@ -98,7 +96,7 @@ def specular_lobe(
     cosine = jnp.maximum(jnp.where(seen, cos_i + cos_o, 1.0), _LEAST_HALF_COSINE)
     squared_cosine = cosine * cosine
     ratio = squared_length / squared_cosine  # 1 / cos^2 a
-    slope = clamped_roughness(roughness)
+    slope = jnp.clip(roughness, *ROUGHNESS_RANGE)
     squared_slope = slope * slope
     spread = jnp.exp((1 - ratio) / squared_slope) / (jnp.pi * squared_slope)
     half_cosine = 0.5 * jnp.sqrt(squared_length)  # H.V, the same for wi and wo
@@ -106,13 +104,7 @@ def specular_lobe(
     return jnp.where(seen, specular * fresnel * spread * ratio / squared_cosine, 0.0)
 
 
-def _nodes(count: int) -> np.ndarray:
-    return np.cos(np.pi * (np.arange(count) + 0.5) / count)
-
-
-def _lobe_quadrature(
-    mu: np.ndarray, roughness: np.ndarray, nodes: tuple[int, int] = (64, 32)
-) -> np.ndarray:
+def _lobe_quadrature(mu: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     """Integrate the lobe over incident directions, with F = 1 and with F = (1 - H.V)^5; stacked, in
     float64.
 
@@ -125,11 +117,11 @@ def _lobe_quadrature(
     sine = np.sqrt(1 - mu * mu)
     low = np.maximum(-(1 + sine) / mu, -5 * roughness)
     high = np.minimum(mu / (1 + sine), 5 * roughness)
-    x, x_weights = np.polynomial.legendre.leggauss(nodes[0])
+    x, x_weights = np.polynomial.legendre.leggauss(64)
     angle = np.pi / 4 * (x + 1)
     px = low + (high - low) * np.sin(angle)[:, None]
     px_weights = (high - low) * (np.pi / 4 * x_weights * np.cos(angle))[:, None]
-    y, y_weights = np.polynomial.legendre.leggauss(nodes[1])
+    y, y_weights = np.polynomial.legendre.leggauss(32)
     reach = np.minimum(np.sqrt(np.maximum(1 - px * px - 2 * px * sine / mu, 0)), 5 * roughness)
     py = reach * (y + 1) / 2
     squared = px * px + py * py
@@ -147,13 +139,11 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
     """Compute the Chebyshev coefficients of (a, b) over sqrt(mu) and log m, and those over log m of
     their averages with powers of mu.
     """
-    mu = ((1 + _nodes(_MU_NODES)) / 2) ** 2
-    low, high = np.log(ROUGHNESS_RANGE)
-    roughness = np.exp(low + (high - low) * (1 + _nodes(_ROUGHNESS_NODES)) / 2)
-    values = _lobe_quadrature(mu[:, None], roughness)
-    chebvander = np.polynomial.chebyshev.chebvander
-    to_mu = np.linalg.inv(chebvander(_nodes(_MU_NODES), _MU_NODES - 1))
-    to_roughness = np.linalg.inv(chebvander(_nodes(_ROUGHNESS_NODES), _ROUGHNESS_NODES - 1))
+    mu_nodes, roughness_nodes = chebpts1(_MU_NODES), chebpts1(_ROUGHNESS_NODES)
+    roughness = np.exp(np.interp(roughness_nodes, [-1, 1], _LOG_ROUGHNESS))
+    values = _lobe_quadrature(((1 + mu_nodes[:, None]) / 2) ** 2, roughness)
+    to_mu = np.linalg.inv(chebvander(mu_nodes, _MU_NODES - 1))
+    to_roughness = np.linalg.inv(chebvander(roughness_nodes, _ROUGHNESS_NODES - 1))
     coefficients = to_mu @ values @ to_roughness.T
     # 2 mu dmu = 4 u^3 du with u = sqrt(mu): the average is exactly that of the interpolant.
     x, weights = np.polynomial.legendre.leggauss(_MU_NODES)
@@ -178,14 +168,14 @@ def _chebyshev_basis(x: Float[Array, "*points"], count: int) -> Float[Array, "ba
 def _chebyshev_basis_jvp(count, primals, tangents):
     # The derivatives of the polynomials are sums of the polynomials.
     basis = _chebyshev_basis(*primals, count)
-    derivatives = np.pad(np.polynomial.chebyshev.chebder(np.eye(count)), ((0, 1), (0, 0))).T
+    derivatives = np.pad(chebder(np.eye(count)), ((0, 1), (0, 0))).T
     slopes = jnp.tensordot(jnp.asarray(derivatives, basis.dtype), basis, 1)
     return basis, slopes * tangents[0][None]
 
 
 def _roughness_basis(roughness: Float[Array, "*points"]) -> Float[Array, "basis *points"]:
-    low, high = (float(x) for x in np.log(ROUGHNESS_RANGE))
-    t = (2 * jnp.log(clamped_roughness(roughness)) - (low + high)) / (high - low)
+    low, high = _LOG_ROUGHNESS
+    t = (2 * jnp.log(jnp.clip(roughness, *ROUGHNESS_RANGE)) - (low + high)) / (high - low)
     return _chebyshev_basis(t, _ROUGHNESS_NODES)
 
 
