@@ -63,7 +63,6 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
     def stacked_samples(self) -> AbstractLightSample:
         axes, (normal, area) = self.axes(), self.normal_and_area()
         positions = self.center[None] + jnp.asarray(self.sample_offsets(), axes.dtype) @ axes
-
         sample = eqx.Partial(
             EmitterStratum,
             intensity=self.radiance * (area / self.count),
@@ -92,8 +91,7 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
         per_axis = axes / jnp.sum(axes * axes, axis=1, keepdims=True)
         closest = jnp.tensordot(self.nearest(jnp.tensordot(hit, per_axis.T, 1)), axes, 1)
         to_nearest = closest - from_center
-        squared = jnp.sum(to_nearest * to_nearest, axis=-1, keepdims=True)
-        wi = to_nearest / jnp.sqrt(jnp.maximum(squared, 1e-12))
+        wi = to_nearest / _lengths(to_nearest)[..., None]
 
         middle = lobe(mirrored)
         is_seen = (middle > 0) & (albedo > 0)
@@ -121,9 +119,12 @@ class RectangleLight(AbstractAreaLight):
 
     def __check_init__(self):
         if isinstance(self.edges, jax.Array):
-            requirement = "two vectors that span an area; the area is 0"
-            area = self.normal_and_area()[1]
-            check_values("RectangleLight.edges", area, requirement, lambda x: x > 0)
+            check_values(
+                "RectangleLight.edges",
+                self.normal_and_area()[1],
+                "two vectors that span an area; the area is 0",
+                lambda area: area > 0,
+            )
 
     @classmethod
     def facing(

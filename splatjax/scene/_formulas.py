@@ -20,6 +20,7 @@ from ._environment import (
     prefilter,
 )
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, DistantStratum
+from ._scene import rotation_towards
 
 _ROWS = 64  # height of the map used for highlights
 # Softboxes: azimuth and elevation in degrees, half of width and height over distance, radiance.
@@ -83,8 +84,8 @@ class HarmonicLight(AbstractExtendedLight):
     def stacked_samples(self) -> AbstractLightSample:
         directions = jnp.asarray(even_directions(self.count), self.coefficients.dtype)
         irradiance = 4 * jnp.pi / self.count * self.radiance(directions)
-        sample = eqx.Partial(HarmonicStratum, cast_shadows=self.cast_shadows)
-        return jax.vmap(sample)(-directions, irradiance)
+        stratum = eqx.Partial(HarmonicStratum, cast_shadows=self.cast_shadows)
+        return jax.vmap(stratum)(-directions, irradiance)
 
     def highlight(self) -> AbstractHighlight:
         dtype = self.coefficients.dtype
@@ -148,7 +149,8 @@ def studio(height: int = 64) -> Float[Array, "height width 3"]:
     """
     directions, image = pixel_directions(height)[0], jnp.full(3, 0.04)[None, None]
     for azimuth, elevation, half_width, half_height, radiance in _SOFTBOXES:
-        x, y, along = (jnp.tensordot(directions, axis, 1) for axis in _frame(azimuth, elevation))
+        axes = rotation_towards(_towards(azimuth, elevation), jnp.asarray([0.0, 1.0, 0.0]))
+        x, y, along = (jnp.tensordot(directions, axis, 1) for axis in axes)
         edge = jnp.maximum(jnp.abs(x) / half_width, jnp.abs(y) / half_height)
         shown = jax.nn.sigmoid(20 * (1 - edge / jnp.maximum(along, 1e-3)))
         image = image + shown[..., None] * jnp.asarray(radiance)[None, None]
@@ -182,7 +184,7 @@ def sun_and_sky(
     """
     directions, solid_angles = pixel_directions(height)
     zenith, horizon, sun = (jnp.asarray(rgb)[None, None] for rgb in (_ZENITH, _HORIZON, _SUN))
-    to_sun = jnp.tensordot(directions, _frame(azimuth, elevation)[2], 1)[..., None] - 1
+    to_sun = jnp.tensordot(directions, _towards(azimuth, elevation), 1)[..., None] - 1
     rise = jnp.sqrt(jnp.maximum(directions[..., 1:2], 1e-4))
     sky = horizon + (zenith - horizon) * rise + 0.5 * horizon * jnp.exp(6 * to_sun)
     nearest = jax.lax.stop_gradient(jnp.max(to_sun))  # cancels in the normalized disk
@@ -192,9 +194,8 @@ def sun_and_sky(
     return jnp.where(directions[..., 1:2] > 0, sky, 0.12) + disk * sun
 
 
-def _frame(azimuth: Numbers, elevation: Numbers) -> Float[Array, "3 3"]:
-    """Compute the directions along the horizon at a point of the sky, above it, and towards it."""
+def _towards(azimuth: Numbers, elevation: Numbers) -> Float[Array, "3"]:
+    """Compute the direction of a point of the sky."""
     turn, rise = (jnp.deg2rad(as_floats(degrees)) for degrees in (azimuth, elevation))
-    (east, south), (high, across) = ((jnp.sin(a), jnp.cos(a)) for a in (turn, rise))
-    right, up = [south, jnp.zeros_like(turn), -east], [-east * high, across, -south * high]
-    return jnp.stack([*right, *up, east * across, high, south * across]).reshape(3, 3)
+    across = jnp.cos(rise)
+    return jnp.stack([jnp.sin(turn) * across, jnp.sin(rise), jnp.cos(turn) * across])

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, is_traced, numbers, record
+from splatjax._records import check_values, is_traced, numbers, record, valid
 from splatjax._smooth import smooth_step
 from splatjax.gaussians import gaussian
 
@@ -190,6 +190,7 @@ class AbstractPointSample(AbstractLightSample):
 
     position: eqx.AbstractVar[Float[Array, "3"]]
     intensity: eqx.AbstractVar[Float[Array, " channels"]]
+    strength_field: ClassVar[str] = "intensity"
 
     def incidence(
         self, points: Float[Array, "*points 3"]
@@ -219,7 +220,6 @@ class PointLight(AbstractPointSample):
 
     position: Float[Array, "3"] = eqx.field(converter=numbers)
     intensity: Float[Array, " channels"] = eqx.field(converter=numbers)
-    strength_field: ClassVar[str] = "intensity"
     cast_shadows: bool = eqx.field(static=True, default=True)
 
 
@@ -245,16 +245,19 @@ class SpotLight(AbstractPointSample):
     position: Float[Array, "3"] = eqx.field(converter=numbers)
     direction: Float[Array, "3"] = eqx.field(converter=numbers)
     intensity: Float[Array, " channels"] = eqx.field(converter=numbers)
-    inner_angle: Float[Array, ""] = eqx.field(converter=numbers, default=20.0)
+    inner_angle: Float[Array, ""] = eqx.field(
+        converter=numbers, default=20.0, metadata=valid("at least 0 degrees", lambda x: x >= 0)
+    )
     outer_angle: Float[Array, ""] = eqx.field(converter=numbers, default=30.0)
-    strength_field: ClassVar[str] = "intensity"
     cast_shadows: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
-        inner, outer = self.inner_angle, self.outer_angle
-        check_values("SpotLight.inner_angle", inner, "at least 0 degrees", lambda x: x >= 0)
-        larger = "larger than inner_angle, and at most 180 degrees"
-        check_values("SpotLight.outer_angle", outer, larger, lambda x: (x > inner) & (x <= 180))
+        check_values(
+            "SpotLight.outer_angle",
+            self.outer_angle,
+            "larger than inner_angle, and at most 180 degrees",
+            lambda x: (x > self.inner_angle) & (x <= 180),
+        )
 
     def incidence(
         self, points: Float[Array, "*points 3"]
@@ -286,7 +289,6 @@ class EmitterStratum(AbstractPointSample):
     position: Float[Array, "3"]
     intensity: Float[Array, " channels"]
     normal: Float[Array, "3"] | None
-    strength_field: ClassVar[str] = "intensity"
     cast_shadows: bool = eqx.field(static=True)
 
     def incidence(
