@@ -41,30 +41,27 @@ class DenseRasterPlan(AbstractRasterPlan):
         settings: SplattingSettings,
         combination: AbstractCombination,
     ) -> FragmentSums:
-        dtype, footprints = attributes.dtype, view.footprints(splats, settings)
-        grid = TileGrid(view.width, view.height)
-        columns = jnp.arange(view.width, dtype=dtype) + 0.5
+        dtype, grid = attributes.dtype, TileGrid(view.width, view.height)
+        columns = jnp.arange(view.width, dtype=dtype)[:, None] + 0.5
+        f = jax.tree.map(lambda row: row[None], view.footprints(splats, settings))
         # The least weight of a fragment that determines the surface behind the front.
-        conic = footprints.a, footprints.b, footprints.c, footprints.nearness
-        least = jax.lax.stop_gradient(least_weight(type(view), *conic, settings.filter_radius))
+        least = least_weight(type(view), f.a, f.b, f.c, f.nearness, settings.filter_radius)
+        least = jax.lax.stop_gradient(least)
 
         def picture_row(y: Float[Array, ""]):
             # Intersect the ray of every pixel with the plane of every splat: nearness and rho^2 are
             # polynomials in the offset from the projected center.
-            dx, dy = columns[:, None] - footprints.x[None], (y - footprints.y)[None]
-            slope = footprints.slope_x[None] * dx + footprints.slope_y[None] * dy
-            nearness = footprints.nearness[None] + slope
-            quadric = dx * (footprints.a[None] * dx + footprints.b[None] * dy)
-            quadric = quadric + footprints.c[None] * dy * dy
+            dx, dy = columns - f.x, y - f.y
+            nearness = f.nearness + f.slope_x * dx + f.slope_y * dy
+            quadric = dx * (f.a * dx + f.b * dy) + f.c * dy * dy
             # Weigh the fragments: hits within the rim (Eq. 1's w_i).
-            inside = footprints.visible[None] & view.inside(nearness, quadric)
+            inside = f.visible & view.inside(nearness, quadric)
             squared_radius = jnp.where(
                 inside, view.squared_radius(jnp.where(inside, nearness, 1.0), quadric), 1.0
             )
-            weight = footprints.opacity[None] * fragment_weight(squared_radius)
-            weight = jnp.where(inside, weight, 0.0)
+            weight = jnp.where(inside, f.opacity * fragment_weight(squared_radius), 0.0)
             # Move every fragment away from the eye by epsilon (3.1).
-            shifted = view.shifted(nearness, footprints.shift[None])
+            shifted = view.shifted(nearness, f.shift)
 
             def nearest(chosen: Bool[Array, "columns splats"]) -> Float[Array, " columns"]:
                 return jnp.max(jnp.where(chosen, shifted, -jnp.inf), axis=1)
@@ -81,7 +78,7 @@ class DenseRasterPlan(AbstractRasterPlan):
             # that weighs something.
             is_open = jax.lax.stop_gradient(in_front[-1]) < settings.hidden_from
             behind = inside & ~front & is_open[:, None]
-            weighty = nearest(behind & (weight > least[None]))
+            weighty = nearest(behind & (weight > least))
             limit = jnp.where(weighty > -jnp.inf, weighty, nearest(behind))
             return in_front, summed(behind & (nearness > limit[:, None]))
 

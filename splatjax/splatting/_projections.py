@@ -96,8 +96,10 @@ class PerspectiveView(AbstractView):
         x, y = middle_x + self.focal_length * u, middle_y + self.focal_length * v
         mid_x, mid_y = stop_gradient(s_gx / kappa), stop_gradient(s_gy / kappa)
         squared_x, squared_y = (xx + s_gx * mid_x) / kappa, (yy + s_gy * mid_y) / kappa
-        half_x = stop_gradient(jnp.sqrt(jnp.where(bounded, squared_x, jnp.inf)))
-        half_y = stop_gradient(jnp.sqrt(jnp.where(bounded, squared_y, jnp.inf)))
+        half_x, half_y = (
+            stop_gradient(jnp.sqrt(jnp.where(bounded, squared, jnp.inf)))
+            for squared in (squared_x, squared_y)
+        )
         cosine = facing / (radius * jnp.sqrt(1 + u * u + v * v))
         epsilon = epsilon_of(splats.radii, settings.filter_radius / scale, cosine, settings)
         return Footprints(

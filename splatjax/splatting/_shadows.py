@@ -99,8 +99,8 @@ class Bounds(eqx.Module):
         )
         center = 0.5 * (low + high)
         offset = splats.centers - center[None]
-        squared = jnp.where(exists, jnp.sum(offset * offset, axis=1), -jnp.inf)
-        squared = extreme(squared, combination)
+        squared = jnp.sum(offset * offset, axis=1)
+        squared = extreme(jnp.where(exists, squared, -jnp.inf), combination)
         apart = squared > 0  # a single splat lies in its center, wherever it moves
         reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)
         radius = reach + extreme(splats.radii, combination)
@@ -297,8 +297,9 @@ def _compared(
     inside = (at_x >= 0) & (at_y >= 0) & (at_x < view.width) & (at_y < view.height)
     middle = step.astype(x.dtype) + 0.5
     away_x, away_y = (column - x)[None] + middle, (row - y)[None] + middle
-    across, down = (slope_x[None] * away_x)[:, None], (slope_y[None] * away_y)[None]
-    expected = depth[None, None] + across + down
+    expected = (
+        depth[None, None] + (slope_x[None] * away_x)[:, None] + (slope_y[None] * away_y)[None]
+    )
 
     def hidden(map_depth, map_coverage):
         beyond = (expected - map_depth) / reach[None, None]

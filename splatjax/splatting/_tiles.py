@@ -122,9 +122,9 @@ class TilePlan(AbstractRasterPlan):
         # Coarse capacities, so that other bodies and pictures of the size share the program.
         grid = self.rasterizer.grid(views[0])
         bins = BinCapacity(1 << plan.bins.pairs.bit_length(), grid.padded_count // grid.lanes)
-        front = bins.chunks * grid.lanes
+        every_tile = SurfaceCapacity(grid.padded_count, grid.padded_count)
         seen = min(1 << plan.splats.bit_length(), joined.count)
-        coarse = TilePlan(self.rasterizer, seen, bins, SurfaceCapacity(front, front))
+        coarse = TilePlan(self.rasterizer, seen, bins, every_tile)
         most = max(int(_tiles_behind(joined, view, settings, coarse)) for view in views)
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))

@@ -28,8 +28,9 @@ _SLOPE_FILTER = 0.25  # pixels; see `widen_ellipse`
 # The weight sum that covers a pixel inside a surface. Splats whose radius is 1.5 times the root of
 # their area, scattered at random, have at least 0.2 inside a closed surface.
 CLOSED = 0.15
-# Unevenness of splats, and the fraction of their mean weight sum that covers a pixel.
-_EVEN, _SCATTERED = (0.1, 0.75), (0.35, 0.11)
+# Unevenness of even and of scattered splats, and the fraction of their mean weight sum that covers
+# a pixel.
+_UNEVENNESS, _FRACTIONS = (0.1, 0.35), (0.75, 0.11)
 _MEAN_WEIGHT = (1 - 13 * math.exp(-4)) / 4  # `fragment_weight` over a disc
 
 
@@ -84,9 +85,8 @@ class SplattingSettings(eqx.Module):
         """
         if self.full_coverage is not None:
             return self
-        (even, fraction_even), (scattered, fraction_scattered) = _EVEN, _SCATTERED
-        share = jnp.clip((unevenness - even) / (scattered - even), 0, 1)
-        fraction = fraction_even + share * (fraction_scattered - fraction_even)
+        known = (jnp.asarray(values, unevenness.dtype) for values in (_UNEVENNESS, _FRACTIONS))
+        fraction = jnp.interp(unevenness, *known)
         full = jnp.minimum(fraction * _MEAN_WEIGHT * math.pi * discs, 1.0)
         return dataclasses.replace(self, full_coverage=full)
 
