@@ -75,10 +75,9 @@ class EnvironmentLight(AbstractExtendedLight):
                 "latitude-longitude map, twice as wide as high"
             )
         if isinstance(self.directions, jax.Array):
-            lengths = jnp.linalg.norm(self.directions, axis=-1)
-            if lengths.size == 0:
-                raise ValueError("EnvironmentLight.directions is empty; give one or more")
-            check_values("EnvironmentLight.directions", lengths, "not zero", lambda x: x > 0)
+            name, lengths = "EnvironmentLight.directions", jnp.linalg.norm(self.directions, axis=-1)
+            check_values(f"the number of {name}", lengths.size, "at least 1", lambda n: n >= 1)
+            check_values(name, lengths, "not zero", lambda x: x > 0)
 
     def radiance(self) -> Float[Array, "height width channels"]:
         return self.image * self.strength[None, None]

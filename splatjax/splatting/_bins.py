@@ -90,12 +90,12 @@ def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
     def of_item(values):
         return values.at[item].get(mode="promise_in_bounds")
 
+    corner = ranges.top * grid.across + ranges.left
     local, across = pair - of_item(begins), jnp.maximum(of_item(ranges.across), 1)
     down = ((local.astype(jnp.float32) + 0.5) / across.astype(jnp.float32)).astype(
         jnp.int32
     )  # exact, since an item has fewer than 2^22 tiles
-    first = of_item(ranges.top * grid.across + ranges.left)
-    tile = first + local + down * (grid.across - across)
+    tile = of_item(corner) + local + down * (grid.across - across)
     # The integer is exact but may wrap around; the float rounds but does not wrap around.
     needed = jnp.sum(counts.astype(jnp.float32)) / capacity
     needed = jnp.maximum(needed, needed_over_planned(total, capacity))

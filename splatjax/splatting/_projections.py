@@ -215,7 +215,6 @@ class OrthographicView(AbstractView):
         )
         x, y = self.width / 2 + self.scale * px, self.height / 2 + self.scale * py
         half_x, half_y = (jnp.sqrt(squared) for squared in squares)
-        filter_radius = jnp.broadcast_to(settings.filter_radius / self.scale, splats.radii.shape)
         return Footprints(
             x=x,
             y=y,
@@ -225,7 +224,9 @@ class OrthographicView(AbstractView):
             b=b,
             c=c,
             nearness=-pz,
-            shift=stop_gradient(epsilon_of(splats.radii, filter_radius, -nz, settings)),
+            shift=stop_gradient(
+                epsilon_of(splats.radii, settings.filter_radius / self.scale, -nz, settings)
+            ),
             opacity=jnp.where(visible, root_determinant / filtered_determinant, 0.0),
             box=stop_gradient((x - half_x, x + half_x, y - half_y, y + half_y)),
             visible=visible,

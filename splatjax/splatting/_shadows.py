@@ -125,10 +125,12 @@ def distant_view(
 ) -> OrthographicView:
     """Make the view of a directional light: the bounding sphere in parallel projection."""
     size = settings.resolution
-    scale = 0.5 * (size - 4) / bounds.radius
-    rotation = _rotation_towards(direction / jnp.linalg.norm(direction))
     return OrthographicView(
-        position=bounds.center, rotation=rotation, scale=scale, width=size, height=size
+        position=bounds.center,
+        rotation=_rotation_towards(direction / jnp.linalg.norm(direction)),
+        scale=0.5 * (size - 4) / bounds.radius,
+        width=size,
+        height=size,
     )
 
 

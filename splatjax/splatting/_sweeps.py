@@ -186,8 +186,7 @@ def _front_limits(part: PartSweep) -> tuple[Float[Array, "tiles pixels"], Int[Ar
     def look(_, lanes, limits):
         return limits.at[lanes].set(part.front_limits(lanes), mode="drop")
 
-    shape = grid.count, TILE_SIDE**2
-    limits = zeros_after(part.numbers, shape, part.numbers.dtype) - jnp.inf
+    limits = zeros_after(part.numbers, (grid.count, TILE_SIDE**2), part.numbers.dtype) - jnp.inf
     listed = jnp.where(bins.counts[bins.order] > 0, bins.order, grid.count)
     return _each_round(part, listed, (), look, limits), grid.blocks(bins.counts[: grid.count])
 
