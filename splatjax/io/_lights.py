@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from splatjax._records import check_values
-from splatjax.exports import plain_numbers
 from splatjax.inverse import KnownIntensity, Observation, UnknownColor, UnknownIntensity
 from splatjax.scene import (
     AbstractLight,
@@ -30,36 +29,32 @@ from splatjax.scene import (
 from ._cameras import gltf_nodes
 from ._files import StrPath, atomic_path, check_units, existing_file, naming, with_y_up
 from ._images import read_picture
-from ._tables import Table, read_toml
+from ._tables import Table, plain_record, read_toml, record_names
 from ._trimesh import one_sentence
 
 PLACE = ("position", "target", "up", "fov")
 _MOST_ROWS = 512  # largest number of rows of an environment
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
 ENVIRONMENTS = {"studio": studio, "overcast": overcast_sky, "sun": sun_and_sky}
-# Optional entries of environments and of spot lights.
-_OF_MAPS = ("rotation", "strength", "up", "directions", "count", "cast_shadows")
-_ANGLES = ("inner_angle", "outer_angle")
-_OPTIONAL = _OF_MAPS + _ANGLES
-# For lights that may face a `target`: their position, and the entry that the target replaces.
-_AIMED = {
-    "spot": ("position", "direction"),
-    "beam": ("origin", "direction"),
-    "rectangle": ("center", "edges"),
-    "disk": ("center", "direction"),
-}
 _LIGHTS = {
-    "directional": (DirectionalLight, ("direction", "irradiance", "cast_shadows")),
-    "point": (PointLight, ("position", "intensity", "cast_shadows")),
-    "spot": (SpotLight, ("position", "direction", "intensity", *_ANGLES, "cast_shadows")),
-    "beam": (GaussianBeam, ("origin", "direction", "power", "variance")),
-    "rectangle": (RectangleLight, ("center", "radiance", "edges", "count", "cast_shadows")),
-    "disk": (DiskLight, ("center", "radiance", "direction", "radius", "count", "cast_shadows")),
-    "sphere": (SphereLight, ("center", "radiance", "radius", "count", "cast_shadows")),
-    "environment": (EnvironmentLight, ("image", *_OF_MAPS)),
+    "directional": DirectionalLight,
+    "point": PointLight,
+    "spot": SpotLight,
+    "beam": GaussianBeam,
+    "rectangle": RectangleLight,
+    "disk": DiskLight,
+    "sphere": SphereLight,
+    "environment": EnvironmentLight,
+}
+# Of lights that may face a `target`: the place, and the field that the target replaces.
+_AIMED = {
+    SpotLight: ("position", "direction"),
+    GaussianBeam: ("origin", "direction"),
+    RectangleLight: ("center", "edges"),
+    DiskLight: ("center", "direction"),
 }
 _FACING = {"target", "width", "height"}
-LIGHT_ENTRIES = _FACING.union({"kind"}, *(names for _, names in _LIGHTS.values()))
+LIGHT_ENTRIES = {"kind", *_FACING}.union(*map(record_names, _LIGHTS.values()))
 
 
 def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
@@ -202,17 +197,19 @@ def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
 
     **Raises:** `ValueError` for a light of a kind that a file cannot store.
     """
-    for kind, (record, names) in _LIGHTS.items():
-        if type(light) is record:
-            values = {name: getattr(light, name) for name in names if name != "image"}
-            if (given := values.get("directions")) is not None:
-                is_even = np.array_equal(given, even_directions(len(given)).astype(given.dtype))
-                values["directions"] = np.asarray(len(given)) if is_even else given
-            plain = {n: plain_numbers(value) for n, value in values.items() if value is not None}
-            return {"kind": kind} | ({"image": image} if "image" in names else {}) | plain
-    raise ValueError(
-        f"a file cannot store a {type(light).__name__}; give lights of kinds {', '.join(_LIGHTS)}"
-    )
+    kinds = {record: kind for kind, record in _LIGHTS.items()}
+    if type(light) not in kinds:
+        raise ValueError(
+            f"a file cannot store a {type(light).__name__}; give lights of kinds "
+            f"{', '.join(_LIGHTS)}"
+        )
+    given = dict[str, Any]()
+    if isinstance(light, EnvironmentLight):
+        given["image"], directions = image, light.directions
+        if directions is not None:
+            even = even_directions(len(directions)).astype(directions.dtype)
+            given["directions"] = len(even) if np.array_equal(directions, even) else directions
+    return {"kind": kinds[type(light)]} | plain_record(light, **given)
 
 
 def _picture(table: Table, name: str) -> np.ndarray:
@@ -222,40 +219,35 @@ def _picture(table: Table, name: str) -> np.ndarray:
 
 def light_of(table: Table, channels: int) -> AbstractLight:
     """Make a light from a table, with the channels of a picture."""
-    kind = table.one_of("kind", _LIGHTS)
-    light, names = _LIGHTS[kind]
-    known, values = {"kind", *names}, dict[str, Any]()
-    if "target" in table.entries and kind in _AIMED:
-        place, aim = _AIMED[kind]
+    light = _LIGHTS[table.one_of("kind", _LIGHTS)]
+    names, given = {"kind", *record_names(light)}, dict[str, Any]()
+    if "target" in table.entries and light in _AIMED:
+        place, aim = _AIMED[light]
         center, target = table.numbers(place), table.numbers("target")
-        values[aim] = target - center
-        if kind == "rectangle":
+        given[aim] = target - center
+        names = names - {aim} | {"target"}
+        if light is RectangleLight:
+            names |= _FACING
             size = table.number("width"), table.number("height")
-            values[aim] = table.make(RectangleLight.facing, center, target, *size, 1.0).edges
-        known = known - {aim} | (_FACING if kind == "rectangle" else {"target"})
-    table = Table(table.path, table.name, table.entries, known)
-    fields = [name for name in names if name in table.entries or name not in _OPTIONAL]
-    special = {"image", "count", "cast_shadows", *values}
-    values |= {name: table.numbers(name) for name in fields if name not in special}
-    if "count" in fields:
-        values["count"] = int(table.number("count"))
-    if kind == "environment":
-        image = table.text("image")
-        image = image if Path(image).suffix else table.one_of("image", ENVIRONMENTS)
-        values["image"] = (
-            ENVIRONMENTS[image]()
-            if image in ENVIRONMENTS
-            else table.make(load_environment, table.folder / image).image
-        )
-        if "directions" in values and values["directions"].ndim == 0:
-            values["directions"] = even_directions(int(values["directions"]))
-    strength = values.get(light.strength_field, np.ones(1))
+            given[aim] = table.make(RectangleLight.facing, center, target, *size, 1.0).edges
+    table = Table(table.path, table.name, table.entries, names)
+    if light is EnvironmentLight:
+        given["image"] = _environment_image(table)
+        count = table.entries.get("directions")
+        if not isinstance(count, list | None):
+            given["directions"] = even_directions(int(table.number("directions")))
+    strength = table.numbers(light.strength_field, 1.0)
     table.make(check_values, light.strength_field, strength, "at least 0", lambda x: x >= 0)
     if strength.size not in (1, channels):
         raise ValueError(
             f"{table.where} {light.strength_field} is {strength.tolist()}, for a picture of "
             f"{channels} channels; give one number, or one for each channel"
         )
-    if "cast_shadows" in names:
-        values["cast_shadows"] = table.one_of("cast_shadows", (True, False), True)
-    return table.make(light, **values).with_channels(channels)
+    return table.record(light, **given).with_channels(channels)
+
+
+def _environment_image(table: Table) -> Any:
+    image = table.text("image")
+    if Path(image).suffix:
+        return table.make(load_environment, table.folder / image).image
+    return ENVIRONMENTS[table.one_of("image", ENVIRONMENTS)]()

@@ -31,16 +31,13 @@ from ._media import (
     LAYER_ENTRIES,
     MEDIUM_ENTRIES,
     OPENPBR_ENTRIES,
-    SKIN_ENTRIES,
     layer_of,
     medium_of,
     plain_layer,
     plain_medium,
     plain_openpbr,
-    plain_skin,
-    skin_of,
 )
-from ._tables import Table, nearest, read_toml, write_toml
+from ._tables import Table, nearest, plain_record, read_toml, record_names, write_toml
 
 VARIANCE_UNIT = "mm^2"
 _KINDS = {"medium": "[medium]", "openpbr": "[openpbr]", "layers": "[[layers]]", "skin": "[skin]"}
@@ -101,7 +98,7 @@ def read_material(tables: Table) -> Material:
         )
     fit = tables.table("fit", tables.entries["fit"])
     fit.one_of("unit", [VARIANCE_UNIT])
-    gaussians = fit.make(SumOfGaussians, fit.numbers("variances"), fit.numbers("weights"))
+    gaussians = fit.record(SumOfGaussians)
     fit.make(
         check_values,
         "the steps of variances",
@@ -114,12 +111,9 @@ def read_material(tables: Table) -> Material:
         terms["medium"] = profile.medium
     if "single_scattering" in tables.entries:
         table = tables.table("single_scattering", (*MEDIUM_ENTRIES, "strength"))
-        terms["single_scattering"] = table.make(
-            SingleScattering, medium_of(table), table.numbers("strength", 1.0)
-        )
+        terms["single_scattering"] = table.record(SingleScattering, medium=medium_of(table))
     if "angles" in tables.entries:
-        table = tables.table("angles", ("coefficients",))
-        terms["angles"] = table.make(AngularLaw, table.numbers("coefficients"))
+        terms["angles"] = tables.table("angles", record_names(AngularLaw)).record(AngularLaw)
     return fit.make(Material, gaussians, **terms)
 
 
@@ -230,26 +224,23 @@ def plain_material(
         )
     tables: dict[str, Any] = {}
     if isinstance(profile, Skin):
-        tables["skin"] = plain_skin(profile)
+        tables["skin"] = plain_record(profile)
     elif isinstance(profile, LayeredMultipole):
         tables["layers"] = [plain_layer(layer) for layer in profile.layers]
     elif (medium := material.medium if profile is None else profile.medium) is not None:
         tables["medium"] = plain_medium(medium) | ({"g": g} if g else {})
-    single, gaussians = material.single_scattering, material.gaussians
-    if single is not None:
-        tables["single_scattering"] = {
-            **plain_medium(single.medium),
-            "strength": plain_numbers(single.strength),
-        }
+    if (single := material.single_scattering) is not None:
+        tables["single_scattering"] = plain_medium(single.medium) | plain_record(
+            single, medium=None
+        )
     if material.angles is not None:
-        tables["angles"] = {"coefficients": plain_numbers(material.angles.coefficients)}
+        tables["angles"] = plain_record(material.angles)
     return tables | {
         "surface": {name: plain_numbers(getattr(material, name)) for name in _SURFACE},
         "source": dict(source or {}),
         "fit": {
             "unit": VARIANCE_UNIT,
-            "variances": plain_numbers(gaussians.variances),
-            "weights": plain_numbers(gaussians.weights),
+            **plain_record(material.gaussians),
             **({} if profile is None else {"profile": _description(profile)}),
             **{
                 name: value if isinstance(value, str | int | float) else plain_numbers(value)
@@ -285,7 +276,7 @@ def _profile(tables: Table) -> Dipole | LayeredMultipole | Skin | None:
     if not kinds:
         return None
     if "skin" in kinds:
-        return skin_of(tables.table("skin", SKIN_ENTRIES))
+        return tables.table("skin", record_names(Skin)).record(Skin)
     layers = [layer_of(layer) for layer in tables.tables("layers", LAYER_ENTRIES)]
     with naming(f"{path}: [[layers]]"):
         return LayeredMultipole(layers)

@@ -2,16 +2,14 @@
 free path, or pigments.
 """
 
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
 from splatjax._records import check_values
-from splatjax.exports import plain_numbers
-from splatjax.scattering import Film, HalfSpace, Layer, Medium, Skin
+from splatjax.scattering import Film, HalfSpace, Layer, Medium
 
-from ._tables import Table
+from ._tables import Table, plain_record
 
 COEFFICIENT_UNIT, THICKNESS_UNIT = "1/mm", "mm"
 _PER_MM = {COEFFICIENT_UNIT: 1.0, "1/cm": 0.1}
@@ -31,7 +29,6 @@ _OPENPBR: dict[str, Any] = {
 }
 OPENPBR_ENTRIES = "unit", *_OPENPBR
 MEDIUM_ENTRIES = ("unit", "eta", *sorted(set().union(*_WAYS)))
-SKIN_ENTRIES = tuple(field.name for field in fields(Skin))
 LAYER_ENTRIES = (*MEDIUM_ENTRIES, "optical_depth", "thickness", "thickness_unit")
 
 
@@ -70,45 +67,24 @@ def plain_openpbr(table: Table) -> dict[str, Any]:
 def layer_of(table: Table) -> Layer | Film:
     """Make the layer or film of a table."""
     if "optical_depth" in table.entries:
-        return table.make(Film, table.numbers("optical_depth"))
+        return table.record(Film)
     if {"g", "sigma_s_prime"} <= table.entries.keys():
         raise ValueError(
             f"{table.where} has g and sigma_s_prime, and layers have reduced scattering alone; "
             "leave g out, or give sigma_s and g"
         )
     table.one_of("thickness_unit", [THICKNESS_UNIT])
-    layer = table.make(Layer, medium_of(table), table.numbers("thickness"))
+    layer = table.record(Layer, medium=medium_of(table))
     table.make(layer.check_diffusion)
     return layer
 
 
 def plain_medium(medium: Medium) -> dict[str, Any]:
-    return {
-        "unit": COEFFICIENT_UNIT,
-        "sigma_a": plain_numbers(medium.sigma_a),
-        "sigma_s_prime": plain_numbers(medium.sigma_s_prime),
-        "eta": plain_numbers(medium.eta),
-    }
+    return {"unit": COEFFICIENT_UNIT, **plain_record(medium)}
 
 
 def plain_layer(layer: Layer | Film) -> dict[str, Any]:
     if isinstance(layer, Film):
-        return {"optical_depth": plain_numbers(layer.optical_depth)}
-    return {
-        "thickness": plain_numbers(layer.thickness),
-        "thickness_unit": THICKNESS_UNIT,
-        **plain_medium(layer.medium),
-    }
-
-
-def skin_of(table: Table) -> Skin:
-    """Make the skin of a table; missing entries have the defaults of `Skin`."""
-    values = {
-        name: table.numbers(name) if name == "wavelengths" else table.number(name)
-        for name in table.entries
-    }
-    return table.make(Skin, **values)
-
-
-def plain_skin(skin: Skin) -> dict[str, Any]:
-    return {name: plain_numbers(getattr(skin, name)) for name in SKIN_ENTRIES}
+        return plain_record(layer)
+    thickness = plain_record(layer, medium=None)
+    return {**thickness, "thickness_unit": THICKNESS_UNIT, **plain_medium(layer.medium)}

@@ -10,7 +10,6 @@ from typing import Any
 import equinox as eqx
 
 from splatjax.diffusion import ClusterDiffuser, ExitanceDiffuser, ShapeDiffuser
-from splatjax.exports import plain_numbers
 from splatjax.geometry import Mesh, bust, bust_mesh
 from splatjax.render import RenderSettings
 from splatjax.scene import Camera, EnvironmentLight, Material, Scene, Splats
@@ -22,7 +21,7 @@ from ._lights import LIGHT_ENTRIES, PLACE, light_of, look_at, plain_light, write
 from ._materials import MATERIAL_TABLES, load_material, plain_material, read_material
 from ._meshes import read_textured_mesh, sample_mesh
 from ._ply import read_splats, write_splats
-from ._tables import Table, read_toml, write_toml
+from ._tables import Table, plain_record, read_toml, record_names, write_toml
 
 DIFFUSERS = {
     "clusters": ClusterDiffuser(),
@@ -31,8 +30,7 @@ DIFFUSERS = {
 }
 _TABLES = ("material", "splats", "camera", "lights", "settings")
 _BODY = ("file", "mesh", "bust", "count", "mm_per_unit", "up", "scale", "albedo")
-_SIZE, _POSE = ("width", "height"), ("position", "rotation", "focal_length")
-_CAMERA = {*PLACE, *_SIZE, *_POSE, "principal_point", "near", "file", "name", "mm_per_unit"}
+_CAMERA = {*PLACE, *record_names(Camera), "file", "name", "mm_per_unit"}
 
 
 def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
@@ -165,17 +163,12 @@ def plain_scene(
     g: float = 0.0,
 ) -> dict[str, Any]:
     """Return the contents of a scene's file; [splats] and [[lights]] are given."""
-    pose = {
-        name: plain_numbers(value)
-        for name in (*_POSE, "principal_point")
-        if (value := getattr(camera, name)) is not None
-    }
     kinds = {type(diffuser): name for name, diffuser in DIFFUSERS.items()}
     diffusion = kinds.get(type(settings.diffuser), "clusters")
     return {
         "material": plain_material(material, g=g),
         "splats": dict(splats),
-        "camera": pose | {name: getattr(camera, name) for name in (*_SIZE, "near")},
+        "camera": plain_record(camera),
         "lights": list(lights),
         "settings": {"bounces": settings.bounces, "diffusion": diffusion},
     }
@@ -210,6 +203,4 @@ def _camera(table: Table) -> Camera:
     width = int(table.number("width", float(height)))
     if "target" in entries:
         return look_at(table, width, height)
-    names = *_POSE, *(entries.keys() & {"principal_point"})
-    pose = {name: table.numbers(name) for name in names}
-    return table.make(Camera, **pose, width=width, height=height, near=table.number("near", 1e-2))
+    return table.record(Camera, width=width, height=height)

@@ -3,6 +3,7 @@ CSV; and the tables of colour-science, from spectra to color.
 """
 
 import csv
+import dataclasses
 import difflib
 import re
 import tomllib
@@ -18,6 +19,7 @@ import tomli_w
 from jaxtyping import Array, Float
 
 from splatjax._records import Numbers, check_values
+from splatjax.exports import plain_numbers
 from splatjax.scattering import Tabulated
 
 from ._files import StrPath, atomic_path, check_units, existing_file, naming
@@ -110,6 +112,38 @@ class Table:
         """Make a record from entries; its errors name the table."""
         with naming(self.where.rstrip(":")):
             return make(*args, **named)
+
+    def record(self, cls: Callable[..., Made], **given: Any) -> Made:
+        """Make a record of a class from the entries of its fields, except for the given ones. A
+        missing entry is the default of its field.
+        """
+        for field in dataclasses.fields(cls):
+            is_read = field.default is dataclasses.MISSING or field.name in self.entries
+            if field.init and is_read and field.name not in given:
+                given[field.name] = self._field(field.name, field.type)
+        return self.make(cls, **given)
+
+    def _field(self, name: str, kind: Any) -> Any:
+        """Read the entry of a field of some type: a truth value, a number, or numbers."""
+        if kind is bool:
+            return self.one_of(name, (True, False))
+        if kind in (int, float):
+            return kind(self.number(name))
+        is_scalar = getattr(kind, "dim_str", None) == ""
+        return self.number(name) if is_scalar else self.numbers(name)
+
+
+def record_names(cls: Any) -> list[str]:
+    """Return the names of the fields with which records of a class are made."""
+    return [field.name for field in dataclasses.fields(cls) if field.init]
+
+
+def plain_record(record: Any, **given: Any) -> dict[str, Any]:
+    """Return the table of a record, which `Table.record` reads: the fields that are not `None`,
+    except for the given ones, as plain numbers.
+    """
+    values = {name: getattr(record, name) for name in record_names(record)} | given
+    return {name: plain_numbers(value) for name, value in values.items() if value is not None}
 
 
 def write_toml(path: StrPath, tables: Mapping[str, Any]) -> None:
