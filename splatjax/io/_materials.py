@@ -73,24 +73,19 @@ def material_path(name_or_path: StrPath) -> Path:
     )
 
 
-def load_material(name_or_path: StrPath) -> Material:
+def load_material(name_or_path: StrPath | Table) -> Material:
     r"""Load a material: its fitted Gaussians and its surface.
 
     **Arguments:**
 
-    - `name_or_path`: one of `list_materials()`, or the path of a TOML file.
+    - `name_or_path`: one of `list_materials()`, the path of a TOML file, or the tables of one.
 
     **Returns:** a `Material` in JAX's default precision; variances in mm^2, ascending.
 
     **Raises:** `ValueError` for an unknown name, and for a file that is not a material, with the
     fault and the remedy.
     """
-    return read_material(_tables(name_or_path))
-
-
-def read_material(tables: Table) -> Material:
-    """Read a material from its tables: `load_material`."""
-    profile = _profile(tables)
+    tables, surface, profile = _read(name_or_path)
     if "fit" not in tables.entries:
         path, fitted = tables.path, tables.path.with_name(f"{tables.path.stem}_fitted.toml")
         raise ValueError(
@@ -106,7 +101,7 @@ def read_material(tables: Table) -> Material:
         "positive: variances ascend",
         lambda x: x > 0,
     )
-    terms: dict[str, Any] = dict(_surface(tables))
+    terms: dict[str, Any] = dict(surface)
     if isinstance(profile, Dipole):
         terms["medium"] = profile.medium
     if "single_scattering" in tables.entries:
@@ -122,8 +117,8 @@ def surface_and_source(name_or_path: StrPath) -> tuple[dict[str, Any], dict[str,
 
     **Raises:** `ValueError` as `load_material` does.
     """
-    _profile(tables := _tables(name_or_path))
-    return _surface(tables), tables.entries.get("source", {})
+    tables, surface, _ = _read(name_or_path)
+    return surface, tables.entries.get("source", {})
 
 
 def load_medium(name_or_path: StrPath) -> Medium:
@@ -138,7 +133,7 @@ def load_medium(name_or_path: StrPath) -> Medium:
     **Raises:** `ValueError` as `load_material` does, and for a material that was published without
     coefficients.
     """
-    profile = _profile(tables := _tables(name_or_path))
+    tables, _, profile = _read(name_or_path)
     if isinstance(profile, Dipole):
         return profile.medium
     contents = "layers or pigments (`load_profile`)" if profile else "Gaussians (`load_material`)"
@@ -152,8 +147,8 @@ def load_mean_cosine(material: StrPath | Table) -> float:
 
     **Raises:** `ValueError` as `load_material` does.
     """
-    tables = material if isinstance(material, Table) else _tables(material)
-    if not isinstance(_profile(tables), Dipole):
+    tables, _, profile = _read(material)
+    if not isinstance(profile, Dipole):
         return 0.0
     return tables.table("medium", MEDIUM_ENTRIES).number("g", 0.0)
 
@@ -171,7 +166,7 @@ def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin:
 
     **Raises:** `ValueError` as `load_medium` does.
     """
-    return _profile(_tables(name_or_path)) or Dipole(load_medium(name_or_path))
+    return _read(name_or_path)[2] or Dipole(load_medium(name_or_path))
 
 
 def load_skin(material: StrPath | Table) -> Skin | None:
@@ -179,7 +174,7 @@ def load_skin(material: StrPath | Table) -> Skin | None:
 
     **Raises:** `ValueError` as `load_medium` does.
     """
-    profile = _profile(material if isinstance(material, Table) else _tables(material))
+    profile = _read(material)[2]
     return profile if isinstance(profile, Skin) else None
 
 
@@ -258,44 +253,36 @@ def _tables(name_or_path: StrPath) -> Table:
     return Table(path, "", entries, MATERIAL_TABLES)
 
 
-def _profile(tables: Table) -> Dipole | LayeredMultipole | Skin | None:
-    """Check all tables of a material, and read its coefficients."""
-    path, entries = tables.path, tables.entries
-    kinds = [kind for kind in _KINDS if kind in tables.entries]
-    if len(kinds) > 1 or not (kinds or "fit" in tables.entries):
+def _read(
+    material: StrPath | Table,
+) -> tuple[Table, dict[str, Array], Dipole | LayeredMultipole | Skin | None]:
+    """Read the tables of a material, its surface, and its coefficients, if any."""
+    tables = material if isinstance(material, Table) else _tables(material)
+    path, entries, profile = tables.path, tables.entries, None
+    kinds = [kind for kind in _KINDS if kind in entries]
+    if len(kinds) > 1 or not (kinds or "fit" in entries):
         contents = (
             " and ".join(_KINDS[kind] for kind in kinds)
             or f"no {', '.join(_KINDS.values())} or [fit]"
         )
         raise ValueError(f"{path}: has {contents}; give one of them")
-    _surface(tables)
-    if "openpbr" in kinds:
-        entries["medium"] = plain_openpbr(tables.table("openpbr", OPENPBR_ENTRIES))
-    if "medium" in entries:
-        return Dipole(medium_of(tables.table("medium", MEDIUM_ENTRIES)))
-    if not kinds:
-        return None
-    if "skin" in kinds:
-        return tables.table("skin", record_names(Skin)).record(Skin)
-    layers = [layer_of(layer) for layer in tables.tables("layers", LAYER_ENTRIES)]
-    with naming(f"{path}: [[layers]]"):
-        return LayeredMultipole(layers)
-
-
-def _surface(tables: Table) -> dict[str, Array]:
-    if "surface" not in tables.entries:
-        return {}
     table = tables.table("surface", _SURFACE)
     surface = {name: table.numbers(name) for name in table.entries}
     table.make(Material, SumOfGaussians([1.0], [[1.0]]), **surface)  # checks them
-    table.make(
-        check_values,
-        "roughness",
-        surface.get("roughness"),
-        "in (0, 1]",
-        lambda x: (x > 0) & (x <= 1),
-    )
-    return surface
+    roughness = surface.get("roughness")
+    table.make(check_values, "roughness", roughness, "in (0, 1]", lambda x: (x > 0) & (x <= 1))
+    if "openpbr" in kinds:
+        entries["medium"] = plain_openpbr(tables.table("openpbr", OPENPBR_ENTRIES))
+        del entries["openpbr"]
+    if "medium" in entries:
+        profile = Dipole(medium_of(tables.table("medium", MEDIUM_ENTRIES)))
+    elif "skin" in entries:
+        profile = tables.table("skin", record_names(Skin)).record(Skin)
+    elif "layers" in entries:
+        layers = [layer_of(layer) for layer in tables.tables("layers", LAYER_ENTRIES)]
+        with naming(f"{path}: [[layers]]"):
+            profile = LayeredMultipole(layers)
+    return tables, surface, profile
 
 
 def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin) -> str:

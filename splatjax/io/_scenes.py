@@ -18,7 +18,7 @@ from ._cameras import load_camera, resized
 from ._files import StrPath
 from ._images import read_manifest
 from ._lights import LIGHT_ENTRIES, PLACE, light_of, look_at, plain_light, write_image
-from ._materials import MATERIAL_TABLES, load_material, plain_material, read_material
+from ._materials import MATERIAL_TABLES, load_material, plain_material
 from ._meshes import read_textured_mesh, sample_mesh
 from ._ply import read_splats, write_splats
 from ._tables import Table, plain_record, read_toml, record_names, write_toml
@@ -66,7 +66,7 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
     splats = _splats(file.table("splats", _BODY))
     source = material_of_scene(file)
     if isinstance(source, Table):
-        material = read_material(source)
+        material = load_material(source)
     else:
         material = file.make(load_material, source)
         material = material if splats.albedo is None else material.white()
