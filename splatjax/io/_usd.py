@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from splatjax.scene import (
     DirectionalLight,
     DiskLight,
     EnvironmentLight,
-    Material,
     PointLight,
     RectangleLight,
     Scene,
@@ -32,6 +32,77 @@ from ._materialx import openpbr_inputs
 _SUFFIXES = (".usda", ".usdc", ".usd")
 _FOCAL_LENGTH = 50.0  # focal length of the camera; the aperture follows from it
 _FARTHEST = 1e3  # far clipping distance, m
+_SCENE = Template("""#usda 1.0
+(
+    defaultPrim = "scene"
+    metersPerUnit = 1
+    upAxis = "Y"
+)
+
+def Xform "scene"
+{
+    def Mesh "body" (
+        prepend apiSchemas = ["MaterialBindingAPI"]
+    )
+    {
+        rel material:binding = </scene/material>
+        uniform token subdivisionScheme = "none"
+    }
+
+    def Material "material"
+    {
+        token outputs:mtlx:surface.connect = <ND_open_pbr_surface_surfaceshader.outputs:out>
+        token outputs:surface.connect = <UsdPreviewSurface.outputs:surface>
+
+        def Shader "ND_open_pbr_surface_surfaceshader"
+        {
+            uniform token info:id = "ND_open_pbr_surface_surfaceshader"
+            token outputs:out
+            $openpbr
+        }
+
+        def Shader "UsdPreviewSurface"
+        {
+            uniform token info:id = "UsdPreviewSurface"
+            token outputs:surface
+            $preview
+        }
+
+        $albedo
+    }
+
+    def Camera "camera"
+    {
+        $camera
+    }
+
+    $lights
+}
+""")
+# The colors of the vertices, for both surfaces.
+_ALBEDO = """
+        def Shader "ND_geompropvalue_color3"
+        {
+            uniform token info:id = "ND_geompropvalue_color3"
+            string inputs:geomprop = "displayColor"
+            color3f outputs:out
+        }
+
+        def Shader "UsdPrimvarReader_float3"
+        {
+            uniform token info:id = "UsdPrimvarReader_float3"
+            string inputs:varname = "displayColor"
+            float3 outputs:result
+        }
+"""
+_LIGHT = Template("""
+    def $kind "light_$number" (
+        $schemas
+    )
+    {
+        $attributes
+    }
+""")
 
 
 def save_usd(path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None = None) -> None:
@@ -54,159 +125,129 @@ def save_usd(path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None =
     if path.suffix.lower() not in _SUFFIXES:
         raise ValueError(f"{path}: the name of this file must end in {' or '.join(_SUFFIXES)}")
     check_installed(f"{path}: USD", "pxr", "usd-core")
-    from pxr import Usd, UsdGeom, UsdShade
+    from pxr import Usd
 
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/scene").GetPrim())
     body = body_mesh(scene.splats, mesh)
+    has_albedo = body.colors is not None
     with naming(path):
-        material = _material(stage, scene.material, body.colors is not None)
-    UsdShade.MaterialBindingAPI.Apply(_body(stage, body)).Bind(material)
-    _camera(stage, camera)
-    for number, light in enumerate(scene.lights, 1):
-        _light(stage, light, number, path)
+        openpbr, preview = _surfaces(openpbr_inputs(scene.material, 1 / METERS), has_albedo)
+    text = _SCENE.substitute(
+        openpbr=openpbr,
+        preview=preview,
+        albedo=_ALBEDO if has_albedo else "",
+        camera=_camera(camera),
+        lights="".join(_light(path, *numbered) for numbered in enumerate(scene.lights, 1)),
+    )
+    stage = Usd.Stage.CreateInMemory()
+    stage.GetRootLayer().ImportFromString(text)
+    _set_triangles(stage.GetPrimAtPath("/scene/body"), body)
     with atomic_path(path) as temporary:
         stage.GetRootLayer().Export(str(temporary))
 
 
-def _define(
-    stage: Any,
-    name: str,
-    kind: str,
-    attributes: Mapping[str, Any],
-    pose: Float[np.ndarray, "4 4"] | None = None,
-) -> Any:
-    from pxr import Gf, UsdGeom
-
-    prim = stage.DefinePrim(f"/scene/{name}", kind)
-    for key, value in attributes.items():
-        prim.GetAttribute(key).Set(value)
-    if pose is not None:
-        UsdGeom.Xformable(prim).AddTransformOp().Set(Gf.Matrix4d(pose.T))
-    return prim
+def _lines(attributes: Mapping[str, Any]) -> str:
+    return "\n".join(f"{name} = {value}" for name, value in attributes.items())
 
 
-def _body(stage: Any, body: Mesh) -> Any:
-    from pxr import UsdGeom, Vt
-
-    points, normals, extent = (
-        Vt.Vec3fArray.FromNumpy(np.asarray(rows, np.float32))
-        for rows in (body.vertices, body.normals, [body.vertices.min(0), body.vertices.max(0)])
-    )
-    faces = np.asarray(body.faces, np.int32)
-    attributes = {
-        "points": points,
-        "normals": normals,
-        "extent": extent,
-        "faceVertexCounts": Vt.IntArray(len(faces), 3),
-        "faceVertexIndices": Vt.IntArray.FromNumpy(faces.ravel()),
-        "subdivisionScheme": "none",
+def _placed(pose: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+    matrix = tuple(map(tuple, pose.T.tolist()))
+    return {
+        "matrix4d xformOp:transform": matrix,
+        "uniform token[] xformOpOrder": '["xformOp:transform"]',
     }
-    prim = _define(stage, "body", "Mesh", attributes)
+
+
+def _set_triangles(prim: Any, body: Mesh) -> None:
+    from pxr import UsdGeom
+
+    vertices, faces = np.asarray(body.vertices, np.float32), np.asarray(body.faces, np.int32)
+    arrays = {
+        "points": vertices,
+        "normals": np.asarray(body.normals, np.float32),
+        "extent": np.stack([vertices.min(axis=0), vertices.max(axis=0)]),
+        "faceVertexCounts": np.full(len(faces), 3, np.int32),
+        "faceVertexIndices": faces.ravel(),
+    }
+    for name, values in arrays.items():
+        prim.GetAttribute(name).Set(values)
     if body.colors is not None:
-        colors = Vt.Vec3fArray.FromNumpy(np.asarray(body.colors, np.float32))
-        UsdGeom.Mesh(prim).CreateDisplayColorPrimvar("vertex").Set(colors)
-    return prim
+        color = UsdGeom.Mesh(prim).CreateDisplayColorPrimvar("vertex")
+        color.Set(np.asarray(body.colors, np.float32))
 
 
-def _material(stage: Any, material: Material, has_albedo: bool) -> Any:
-    """Define the material as OpenPBR, and as an opaque surface for renderers that lack it."""
-    from pxr import UsdShade
-
-    shown = UsdShade.Material.Define(stage, "/scene/material")
-    inputs = openpbr_inputs(material, 1 / METERS)
-    plain = {
-        "diffuseColor": inputs["subsurface_color"],
-        "roughness": inputs["specular_roughness"],
-        "ior": inputs["specular_ior"],
+def _surfaces(inputs: Mapping[str, list[float]], has_albedo: bool) -> tuple[str, str]:
+    """Return the inputs of OpenPBR, and of an opaque surface for renderers that lack it."""
+    values = {name: v[0] if len(v) == 1 else tuple(v) for name, v in inputs.items()}
+    mtlx = {
+        f"{'float' if isinstance(value, float) else 'color3f'} inputs:{name}": value
+        for name, value in values.items()
     }
-    surface = _shader(stage, "ND_open_pbr_surface_surfaceshader", inputs)
-    preview = _shader(stage, "UsdPreviewSurface", plain)
-    shown.CreateSurfaceOutput("mtlx").ConnectToSource(_output(surface, "out", "Token"))
-    shown.CreateSurfaceOutput().ConnectToSource(_output(preview, "surface", "Token"))
+    plain = {
+        "color3f inputs:diffuseColor": values["subsurface_color"],
+        "float inputs:roughness": values["specular_roughness"],
+        "float inputs:ior": values["specular_ior"],
+    }
     if has_albedo:
-        albedo = _shader(stage, "ND_geompropvalue_color3", {"geomprop": "displayColor"})
-        color = surface.GetInput("subsurface_color")
-        color.ConnectToSource(_output(albedo, "out", "Color3f"))
-        albedo = _shader(stage, "UsdPrimvarReader_float3", {"varname": "displayColor"})
-        color = preview.GetInput("diffuseColor")
-        color.ConnectToSource(_output(albedo, "result", "Float3"))
-    return shown
+        mtlx["color3f inputs:subsurface_color.connect"] = "<../ND_geompropvalue_color3.outputs:out>"
+        plain["color3f inputs:diffuseColor.connect"] = "<../UsdPrimvarReader_float3.outputs:result>"
+    return _lines(mtlx), _lines(plain)
 
 
-def _shader(stage: Any, kind: str, inputs: Mapping[str, str | list[float]]) -> Any:
-    from pxr import Sdf, UsdShade
-
-    shader = UsdShade.Shader.Define(stage, f"/scene/material/{kind}")
-    shader.CreateIdAttr(kind)
-    for name, value in inputs.items():
-        if isinstance(value, str):
-            shader.CreateInput(name, Sdf.ValueTypeNames.String).Set(value)
-        elif len(value) == 1:
-            shader.CreateInput(name, Sdf.ValueTypeNames.Float).Set(value[0])
-        else:
-            shader.CreateInput(name, Sdf.ValueTypeNames.Color3f).Set(tuple(value))
-    return shader
-
-
-def _output(shader: Any, name: str, kind: str) -> Any:
-    from pxr import Sdf
-
-    return shader.CreateOutput(name, getattr(Sdf.ValueTypeNames, kind))
-
-
-def _camera(stage: Any, camera: Camera) -> None:
+def _camera(camera: Camera) -> str:
     size = np.asarray([camera.width, camera.height])
     point = np.asarray(camera.principal_pixel, float) / size
     aperture = _FOCAL_LENGTH / float(camera.focal_length) * size / camera.height
     offset = aperture * (0.5 - point) * [1, -1]
-    attributes = {
-        "focalLength": _FOCAL_LENGTH,
-        "horizontalAperture": aperture[0],
-        "verticalAperture": aperture[1],
-        "horizontalApertureOffset": offset[0],
-        "verticalApertureOffset": offset[1],
-        "clippingRange": (METERS * float(camera.near), _FARTHEST),
-    }
-    _define(stage, "camera", "Camera", attributes, camera_pose(camera))
+    (width, height), (right, up) = aperture.tolist(), offset.tolist()
+    return _lines(
+        {
+            "float focalLength": _FOCAL_LENGTH,
+            "float horizontalAperture": width,
+            "float verticalAperture": height,
+            "float horizontalApertureOffset": right,
+            "float verticalApertureOffset": up,
+            "float2 clippingRange": (METERS * float(camera.near), _FARTHEST),
+            **_placed(camera_pose(camera)),
+        }
+    )
 
 
-def _light(stage: Any, light: AbstractLight, number: int, path: Path) -> None:
-    from pxr import UsdLux
-
+def _light(path: Path, number: int, light: AbstractLight) -> str:
     greatest, color = strength(light)
+    kind, schemas, attributes = type(light).__name__, "", dict[str, Any]()
     match light:
         case DirectionalLight():
-            kind, inputs = "DistantLight", {"angle": 0.0, "normalize": True}
+            kind, attributes = "DistantLight", {"float inputs:angle": 0, "bool inputs:normalize": 1}
         case PointLight() | SpotLight():  # a sphere of 1 mm whose radiance gives the intensity
-            kind, inputs = "SphereLight", {"radius": METERS}
+            kind, attributes = "SphereLight", {"float inputs:radius": METERS}
             greatest /= np.pi
-        case SphereLight():
-            kind, inputs = "SphereLight", {"radius": METERS * float(light.radius)}
-        case DiskLight():
-            kind, inputs = "DiskLight", {"radius": METERS * float(light.radius)}
+        case SphereLight() | DiskLight():
+            attributes = {"float inputs:radius": METERS * float(light.radius)}
         case RectangleLight():
             edges = METERS * np.linalg.norm(np.asarray(light.edges, float), axis=1)
             height, width = edges.tolist()
-            kind, inputs = "RectLight", {"width": width, "height": height}
+            kind = "RectLight"
+            attributes = {"float inputs:width": width, "float inputs:height": height}
         case EnvironmentLight():
             image = path.with_name(f"{path.stem}_{number}.exr")
             write_image(image, light.image)
-            kind, inputs = "DomeLight", {"texture:file": image.name, "texture:format": "latlong"}
+            kind, attributes = "DomeLight", {"asset inputs:texture:file": f"@@@{image.name}@@@"}
+            attributes["token inputs:texture:format"] = '"latlong"'
         case _:
             warnings.warn(
-                f"{path}: USD has no {type(light).__name__}, and is written without it; give "
-                "another light",
-                stacklevel=3,
+                f"{path}: USD has no {kind}, and is written without it; give another light",
+                stacklevel=4,
             )
-            return
-    inputs = {f"inputs:{name}": value for name, value in inputs.items()}
-    inputs |= {"inputs:intensity": greatest, "inputs:color": tuple(color)}
-    prim = _define(stage, f"light_{number}", kind, inputs, light_pose(light))
+            return ""
     if isinstance(light, SpotLight):
         inner, outer = float(light.inner_angle), float(light.outer_angle)
-        cone = UsdLux.ShapingAPI.Apply(prim)
-        cone.CreateShapingConeAngleAttr(outer)
-        cone.CreateShapingConeSoftnessAttr(1 - inner / outer)
+        schemas = 'prepend apiSchemas = ["ShapingAPI"]'
+        attributes["float inputs:shaping:cone:angle"] = outer
+        attributes["float inputs:shaping:cone:softness"] = 1 - inner / outer
+    attributes |= {"float inputs:intensity": greatest, "color3f inputs:color": tuple(color)}
+    return _LIGHT.substitute(
+        kind=kind,
+        number=number,
+        schemas=schemas,
+        attributes=_lines(attributes | _placed(light_pose(light))),
+    )
