@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from splatjax.scene import Camera
 
-from ._files import StrPath, check_units, existing_file, with_y_up
+from ._files import StrPath, check_units, existing_file, require, with_y_up
 from ._trimesh import one_sentence
 
 _Pose: TypeAlias = Float[np.ndarray, "4 4"]
@@ -67,8 +67,7 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
         for name, lens, pose in reader(path):
             name = f"{name} {len(cameras)}" if name in cameras else name
             cameras[name] = _camera(f"{path}: {name}", lens, pose, mm_per_unit, up)
-    if not cameras:
-        raise ValueError(f"{path}: has no perspective camera; export it with its cameras")
+    require(cameras, path, "has no perspective camera; export it with its cameras")
     return cameras
 
 
@@ -76,11 +75,12 @@ def load_camera(path: StrPath, name: str = "0", *, mm_per_unit: float, up: str =
     """Read one of the cameras of a file (`load_cameras`), by its name or its number from 0."""
     cameras = load_cameras(path, mm_per_unit=mm_per_unit, up=up)
     names = {str(number): key for number, key in enumerate(cameras)} | {n: n for n in cameras}
-    if name not in names:
-        raise ValueError(
-            f"{path}: has no camera {name!r}; give one of its {len(cameras)} names "
-            f"({', '.join([*cameras][:3])}, ...), or a number from 0"
-        )
+    require(
+        name in names,
+        path,
+        f"has no camera {name!r}; give one of its {len(cameras)} names "
+        f"({', '.join([*cameras][:3])}, ...), or a number from 0",
+    )
     return cameras[names[name]]
 
 
@@ -101,20 +101,25 @@ def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -
     bent = [f"{name} = {lens[name]}" for name in _DISTORTION if lens.get(name)]
     if bent or model not in _MODELS:
         raise _has_distortion(where, ", ".join([model, *bent]))
-    if not lens.keys() >= {"w", "h", "fl_x"}:
-        raise ValueError(f"{where}: has only {', '.join(lens)}; add w, h and fl_x, in pixels")
+    require(
+        lens.keys() >= {"w", "h", "fl_x"},
+        where,
+        f"has only {', '.join(lens)}; add w, h and fl_x, in pixels",
+    )
     width, height, focal_x = int(lens["w"]), int(lens["h"]), lens["fl_x"]
     focal_y = lens.get("fl_y", focal_x)
-    if not abs(focal_x / focal_y - 1) * width < 2 * _SQUARE:
-        raise ValueError(
-            f"{where}: fl_x is {focal_x:g} and fl_y is {focal_y:g}, of pixels that are not "
-            "square; reconstruct with one focal length, such as SIMPLE_PINHOLE"
-        )
+    require(
+        abs(focal_x / focal_y - 1) * width < 2 * _SQUARE,
+        where,
+        f"fl_x is {focal_x:g} and fl_y is {focal_y:g}, of pixels that are not square; "
+        "reconstruct with one focal length, such as SIMPLE_PINHOLE",
+    )
     left, scales, right = np.linalg.svd(pose[:3, :3])
-    if not scales[0] < (1 + _SHEAR) * scales[2] or np.linalg.det(left @ right) < 0:
-        raise ValueError(
-            f"{where}: its axes {pose[:3, :3].tolist()} are sheared or mirrored; give a rotation"
-        )
+    require(
+        scales[0] < (1 + _SHEAR) * scales[2] and np.linalg.det(left @ right) > 0,
+        where,
+        f"its axes {pose[:3, :3].tolist()} are sheared or mirrored; give a rotation",
+    )
     axes, place = with_y_up((left @ right).T, up), with_y_up(pose[None, :3, 3], up)[0]
     point = np.asarray([lens.get("cx", width / 2) / width, lens.get("cy", height / 2) / height])
     return Camera(

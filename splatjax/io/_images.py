@@ -18,7 +18,7 @@ from splatjax._memory import check_memory
 from splatjax.scene import Camera, Frame
 
 from ._cameras import camera_matrices
-from ._files import StrPath, atomic_path, check_suffix, existing_file, naming
+from ._files import StrPath, atomic_path, check_suffix, existing_file, naming, require
 
 _BYTES_PER_VALUE = 24.0  # while decoding in double precision
 
@@ -70,8 +70,7 @@ def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
     and B nor Y, or has integers, which are encoded for a display.
     """
     values, is_linear = _colors(path)
-    if not is_linear:
-        raise ValueError(f"{path}: is encoded for a display; give linear light, such as OpenEXR")
+    require(is_linear, path, "is encoded for a display; give linear light, such as OpenEXR")
     return values
 
 
@@ -87,16 +86,22 @@ def read_color(path: StrPath) -> Float[np.ndarray, "height width 3"]:
     **Raises:** as `read_picture` does, and `ValueError` for values outside [0, 1].
     """
     values, is_linear = _colors(path)
-    if not ((values >= 0) & (values <= 1)).all():
-        raise ValueError(f"{path}: has an albedo outside [0, 1]; scale it, and remove NaN")
+    require(
+        ((values >= 0) & (values <= 1)).all(),
+        path,
+        "has an albedo outside [0, 1]; scale it, and remove NaN",
+    )
     return np.broadcast_to(values if is_linear else srgb_to_linear(values), (*values.shape[:2], 3))
 
 
 def _colors(path: StrPath) -> tuple[Float[np.ndarray, "height width _"], bool]:
     planes, _, is_linear = read_planes(path)
     names = "RGB" if "R" in planes else "Y"
-    if not planes.keys() >= set(names):
-        raise ValueError(f"{path}: has neither R, G and B nor Y; it has {', '.join(planes)}")
+    require(
+        planes.keys() >= set(names),
+        path,
+        f"has neither R, G and B nor Y; it has {', '.join(planes)}",
+    )
     with np.errstate(invalid="ignore"):  # of NaN that signals
         return np.stack([planes[name] for name in names], axis=-1).astype(np.float64), is_linear
 
@@ -146,9 +151,12 @@ def write_animation(
     **Raises:** `ValueError` for no frames, several sizes, and a speed out of range; `OSError` when
     a frame cannot be read, or the folder does not exist.
     """
-    if not frames or not 0.1 <= frames_per_second <= 60:
-        given = f"{path}: {len(frames)} frames at {frames_per_second:g} per second"
-        raise ValueError(f"{given}; give at least one frame, and 0.1 to 60 per second")
+    require(
+        frames and 0.1 <= frames_per_second <= 60,
+        path,
+        f"{len(frames)} frames at {frames_per_second:g} per second; give at least one frame, and "
+        "0.1 to 60 per second",
+    )
     # Frames begin at rounded milliseconds, so that rounding errors do not add up.
     begins = [round(1000 * i / frames_per_second) for i in range(len(frames) + 1)]
     options = {"save_all": True, "duration": np.diff(begins).tolist(), "loop": 0, "lossless": True}
@@ -167,11 +175,11 @@ class _Film(Image.Image):
     def seek(self, frame: int) -> None:
         with Image.open(self._frames[frame]) as image:
             image.load()
-            if self.size not in ((0, 0), image.size):
-                raise ValueError(
-                    f"{self._frames[frame]}: is {image.size} pixels, and the first is "
-                    f"{self.size}; give all the same size"
-                )
+            require(
+                self.size in ((0, 0), image.size),
+                self._frames[frame],
+                f"is {image.size} pixels, and the first is {self.size}; give all the same size",
+            )
             self.im, self._mode, self._size = image.im, image.mode, image.size
 
 
@@ -295,10 +303,11 @@ def read_manifest(path: StrPath) -> dict[str, Any]:
     record.
     """
     _, header, _ = read_planes(path)
-    if not isinstance(header.get(_MANIFEST), str):
-        raise ValueError(
-            f"{path}: has no record of its settings; give a picture that `splatjax render` wrote"
-        )
+    require(
+        isinstance(header.get(_MANIFEST), str),
+        path,
+        "has no record of its settings; give a picture that `splatjax render` wrote",
+    )
     with naming(path):
         return json.loads(header[_MANIFEST])
 

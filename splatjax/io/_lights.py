@@ -238,11 +238,11 @@ def light_of(table: Table, channels: int) -> AbstractLight:
             given["directions"] = even_directions(int(table.number("directions")))
     strength = table.numbers(light.strength_field, 1.0)
     table.make(check_values, light.strength_field, strength, "at least 0", lambda x: x >= 0)
-    if strength.size not in (1, channels):
-        raise ValueError(
-            f"{table.where} {light.strength_field} is {strength.tolist()}, for a picture of "
-            f"{channels} channels; give one number, or one for each channel"
-        )
+    table.require(
+        strength.size in (1, channels),
+        f"{light.strength_field} is {strength.tolist()}, for a picture of {channels} channels; "
+        "give one number, or one for each channel",
+    )
     return table.record(light, **given).with_channels(channels)
 
 

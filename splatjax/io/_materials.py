@@ -26,7 +26,7 @@ from splatjax.scattering import (
 )
 from splatjax.scene import Material
 
-from ._files import StrPath, naming
+from ._files import StrPath, naming, require
 from ._media import (
     LAYER_ENTRIES,
     MEDIUM_ENTRIES,
@@ -86,11 +86,12 @@ def load_material(name_or_path: StrPath | Table) -> Material:
     fault and the remedy.
     """
     tables, surface, profile = _read(name_or_path)
-    if "fit" not in tables.entries:
-        path, fitted = tables.path, tables.path.with_name(f"{tables.path.stem}_fitted.toml")
-        raise ValueError(
-            f"{path}: has no [fit]; fit its coefficients by `splatjax fit {path} --output {fitted}`"
-        )
+    path, fitted = tables.path, tables.path.with_name(f"{tables.path.stem}_fitted.toml")
+    require(
+        "fit" in tables.entries,
+        path,
+        f"has no [fit]; fit its coefficients by `splatjax fit {path} --output {fitted}`",
+    )
     fit = tables.table("fit", tables.entries["fit"])
     fit.one_of("unit", [VARIANCE_UNIT])
     gaussians = fit.record(SumOfGaussians)
@@ -248,8 +249,11 @@ def plain_material(
 def _tables(name_or_path: StrPath) -> Table:
     path = material_path(name_or_path)
     entries = read_toml(path, "check the path, or give a material (`splatjax materials`)")
-    if entries.keys() & {"splats", "camera", "material"}:
-        raise ValueError(f"{path}: is the file of a scene; give that of a material")
+    require(
+        not entries.keys() & {"splats", "camera", "material"},
+        path,
+        "is the file of a scene; give that of a material",
+    )
     return Table(path, "", entries, MATERIAL_TABLES)
 
 
@@ -259,19 +263,17 @@ def _read(
     """Read the tables of a material, its surface, and its coefficients, if any."""
     tables = material if isinstance(material, Table) else _tables(material)
     path, entries, profile = tables.path, tables.entries, None
-    kinds = [kind for kind in _KINDS if kind in entries]
-    if len(kinds) > 1 or not (kinds or "fit" in entries):
-        contents = (
-            " and ".join(_KINDS[kind] for kind in kinds)
-            or f"no {', '.join(_KINDS.values())} or [fit]"
-        )
-        raise ValueError(f"{path}: has {contents}; give one of them")
+    kinds = [_KINDS[kind] for kind in _KINDS if kind in entries]
+    require(len(kinds) < 2, path, f"has {' and '.join(kinds)}; give one of them")
+    require(
+        kinds or "fit" in entries, path, f"has no {', '.join(_KINDS.values())} or [fit]; give one"
+    )
     table = tables.table("surface", _SURFACE)
     surface = {name: table.numbers(name) for name in table.entries}
     table.make(Material, SumOfGaussians([1.0], [[1.0]]), **surface)  # checks them
     roughness = surface.get("roughness")
     table.make(check_values, "roughness", roughness, "in (0, 1]", lambda x: (x > 0) & (x <= 1))
-    if "openpbr" in kinds:
+    if "openpbr" in entries:
         entries["medium"] = plain_openpbr(tables.table("openpbr", OPENPBR_ENTRIES))
         del entries["openpbr"]
     if "medium" in entries:

@@ -37,11 +37,11 @@ def medium_of(table: Table) -> Medium:
     color and a mean free path.
     """
     names = (table.entries.keys() & set().union(*_WAYS)) - {"g"}
-    if names not in [way - {"g"} for way in _WAYS] or ("sigma_s" in names) > ("g" in table.entries):
-        raise ValueError(
-            f"{table.where} has {', '.join(sorted(names)) or 'no coefficients'}; give sigma_a and "
-            "sigma_s_prime, or sigma_a, sigma_s and g, or color and mean_free_path"
-        )
+    table.require(
+        names in [way - {"g"} for way in _WAYS] and ("sigma_s" in names) <= ("g" in table.entries),
+        f"has {', '.join(sorted(names)) or 'no coefficients'}; give sigma_a and sigma_s_prime, or "
+        "sigma_a, sigma_s and g, or color and mean_free_path",
+    )
     eta, g = table.numbers("eta"), table.number("g", 0.0)
     between = "between -1 and 1, both excluded"
     table.make(check_values, "g", np.asarray(g), between, lambda x: abs(x) < 1)
@@ -68,11 +68,11 @@ def layer_of(table: Table) -> Layer | Film:
     """Make the layer or film of a table."""
     if "optical_depth" in table.entries:
         return table.record(Film)
-    if {"g", "sigma_s_prime"} <= table.entries.keys():
-        raise ValueError(
-            f"{table.where} has g and sigma_s_prime, and layers have reduced scattering alone; "
-            "leave g out, or give sigma_s and g"
-        )
+    table.require(
+        not {"g", "sigma_s_prime"} <= table.entries.keys(),
+        "has g and sigma_s_prime, and layers have reduced scattering alone; leave g out, or give "
+        "sigma_s and g",
+    )
     table.one_of("thickness_unit", [THICKNESS_UNIT])
     layer = table.record(Layer, medium=medium_of(table))
     table.make(layer.check_diffusion)

@@ -22,7 +22,7 @@ from splatjax.geometry import (
 )
 from splatjax.scene import Splats
 
-from ._files import StrPath, check_units, existing_file, naming, with_y_up
+from ._files import StrPath, check_units, existing_file, naming, require, with_y_up
 from ._images import read_color, read_map, srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
@@ -134,8 +134,11 @@ def read_textured_mesh(
     """
     path = existing_file(path)
     check_units(path, mm_per_unit, up)
-    if not 0 <= crease_angle <= 180:
-        raise ValueError(f"{path}: crease_angle is {crease_angle}; give degrees from 0 to 180")
+    require(
+        0 <= crease_angle <= 180,
+        path,
+        f"crease_angle is {crease_angle}; give degrees from 0 to 180",
+    )
     pieces = _read_pieces(path, up)
     flip_v = v_up is not None and v_up == (path.suffix[1:].lower() in ("glb", "gltf"))
     mesh = split_creases(_joined(pieces, mm_per_unit, flip_v), crease_angle)
@@ -146,23 +149,28 @@ def read_textured_mesh(
         share=None if share is None else read_map(share) @ _LUMA,
         factors=1.0 if factors is None else np.asarray(factors, float),
     )
-    if (share is None) != (factors is None):
-        raise ValueError(f"{path}: share is {share}, factors are {factors}; give both, or neither")
+    require(
+        (share is None) == (factors is None),
+        path,
+        f"share is {share}, factors are {factors}; give both, or neither",
+    )
     has_maps = any(name is not None for name in (albedo, specular, normal, share))
-    if has_maps and (mesh.uvs is None or np.isnan(mesh.uvs).any()):
-        raise ValueError(
-            f"{path}: has no texture coordinates, which maps need; give a mesh with UVs (in "
-            "glTF, with a material), or no maps"
-        )
+    require(
+        not has_maps or (mesh.uvs is not None and not np.isnan(mesh.uvs).any()),
+        path,
+        "has no texture coordinates, which maps need; give a mesh with UVs (in glTF, with a "
+        "material), or no maps",
+    )
     if albedo is not None:
         mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, mesh.uvs)
     if crop_min_y is not None:
         top = mesh.vertices[:, 1].max() / mm_per_unit
-        if not crop_min_y < top:
-            raise ValueError(
-                f"{path}: crop_min_y is {crop_min_y:g}, which removes the whole mesh; the mesh "
-                f"ends at y = {top:g} in the file's unit"
-            )
+        require(
+            crop_min_y < top,
+            path,
+            f"crop_min_y is {crop_min_y:g}, which removes the whole mesh; the mesh ends at "
+            f"y = {top:g} in the file's unit",
+        )
         mesh = cut_below(mesh, crop_min_y * mm_per_unit)
     return mesh, textures
 
@@ -174,8 +182,7 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
     finite or faces of missing vertices; or does not fit into memory.
     """
     kind = path.suffix[1:].lower()
-    if kind not in FORMATS:
-        raise ValueError(f"{path}: is not a known mesh format; give {', '.join(FORMATS)}")
+    require(kind in FORMATS, path, f"is not a known mesh format; give {', '.join(FORMATS)}")
     with one_sentence(path):
         content = load_with_trimesh(path, kind)
         pieces = {
@@ -195,10 +202,9 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
             world[node.get("frame_to")] = matrix
             if node.get("geometry") in pieces:
                 placed.append((pieces[node["geometry"]], matrix))
-        if not placed:
-            raise ValueError(
-                f"{path}: has no triangle; give a triangle mesh, or read points with read_splats"
-            )
+        require(
+            placed, path, "has no triangle; give a triangle mesh, or read points with read_splats"
+        )
         corners = sum(3 * len(piece.mesh.faces) + len(piece.mesh.vertices) for piece, _ in placed)
         check_memory(
             f"{path}: a scene of {corners} corners",

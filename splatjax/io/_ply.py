@@ -12,7 +12,7 @@ from jaxtyping import Float
 from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
-from ._files import StrPath, atomic_path, check_units, existing_file, naming, with_y_up
+from ._files import StrPath, atomic_path, check_units, existing_file, naming, require, with_y_up
 from ._gaussian_scenes import GAUSSIAN_COLUMNS, spz_columns, surface_columns
 from ._images import srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
@@ -91,10 +91,10 @@ def read_splats(
     """
     path = existing_file(path)
     check_units(path, mm_per_unit, up)
-    if path.suffix[1:].lower() in set(FORMATS) - {"ply"}:
-        raise ValueError(f"{path}: is a mesh; {_COVER.format(path)}")
+    kind = path.suffix[1:].lower()
+    require(kind == "ply" or kind not in FORMATS, path, f"is a mesh; {_COVER.format(path)}")
     with one_sentence(path):
-        is_spz = path.suffix.lower() == ".spz"
+        is_spz = kind == "spz"
         columns = {} if is_spz else load_with_trimesh(path, "ply")["columns"]
         vertices = spz_columns(path) if is_spz else columns.get("vertex", {})
         if vertices.keys() >= GAUSSIAN_COLUMNS:
@@ -102,8 +102,8 @@ def read_splats(
         fields = _splat_fields(path, vertices, mm_per_unit, up)
     centers = fields.pop("centers")
     _check_places(path, centers, estimated=fields["radii"] is None or fields["areas"] is None)
-    if fields["radii"] is None and columns.get("face"):
-        raise ValueError(f"{path}: is a mesh; {_COVER.format(path)}")
+    is_mesh = fields["radii"] is None and columns.get("face")
+    require(not is_mesh, path, f"is a mesh; {_COVER.format(path)}")
     with naming(path):
         return complete_splats(centers, **fields)
 
@@ -122,11 +122,11 @@ def write_splats(path: StrPath, splats: Splats) -> None:
         values = getattr(splats, field)
         if values is not None:
             table = np.asarray(values, "<f4").reshape(splats.count, -1)
-            if table.shape[1] != len(aliases[0]):
-                raise ValueError(
-                    f"{path}: {field} has {table.shape[1]} channels; a PLY file stores "
-                    f"{', '.join(aliases[0])}"
-                )
+            require(
+                table.shape[1] == len(aliases[0]),
+                path,
+                f"{field} has {table.shape[1]} channels; a PLY file stores {', '.join(aliases[0])}",
+            )
             names += aliases[0]
             columns.append(table)
     if splats.weights is not None:
@@ -175,8 +175,7 @@ class SplatFile:
     ):
         self.path, self.part, self.mm_per_unit, self.up = existing_file(path), part, mm_per_unit, up
         check_units(self.path, mm_per_unit, up)
-        if part < 1:
-            raise ValueError(f"{path}: part is {part}; give at least one splat")
+        require(part >= 1, path, f"part is {part}; give at least one splat")
         with one_sentence(self.path), open(path, "rb") as file:
             from trimesh.exchange.ply import _parse_header  # only where it is needed
 
@@ -189,11 +188,12 @@ class SplatFile:
             self._names, self._columns = tuple(kinds), np.dtype(list(kinds.items()))
             self._rows(0, self.count)  # raises where the file is cut short
         for field in ("normals", "radii", "areas"):
-            if not any(kinds.keys() >= set(names) for names in _COLUMNS[field]):
-                raise ValueError(
-                    f"{path}: its vertices have no {' '.join(_COLUMNS[field][0])}, which cannot be "
-                    f"estimated part by part; {_COMPLETE}"
-                )
+            require(
+                any(kinds.keys() >= set(names) for names in _COLUMNS[field]),
+                path,
+                f"its vertices have no {' '.join(_COLUMNS[field][0])}, which cannot be estimated "
+                f"part by part; {_COMPLETE}",
+            )
 
     def __call__(self) -> Iterator[Splats]:
         """Yield all splats from the beginning, in mm and in JAX's default precision, in parts of
@@ -230,12 +230,12 @@ def _splat_fields(
 
     **Raises:** `ValueError` for values that are not finite, or invalid for splats.
     """
-    if columns.keys() >= _GAUSSIAN_SPLATTING:
-        raise ValueError(
-            f"{path}: is a Gaussian-splatting scene, and lacks some of f_dc_0 to f_dc_2, scale_0 "
-            "to scale_2, rot_0 to rot_3 and opacity, or is read in parts; give all of them to "
-            "read_splats"
-        )
+    require(
+        not columns.keys() >= _GAUSSIAN_SPLATTING,
+        path,
+        "is a Gaussian-splatting scene, and lacks some of f_dc_0 to f_dc_2, scale_0 to scale_2, "
+        "rot_0 to rot_3 and opacity, or is read in parts; give all of them to read_splats",
+    )
     single = {
         name: column
         for name, column in columns.items()
@@ -276,17 +276,17 @@ def _check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: b
     low, high = centers.min(axis=0), centers.max(axis=0)
     reach, extent = float(np.abs([low, high]).max()), float((high - low).max())
     resolved = float(jnp.finfo(jnp.result_type(float)).eps) * reach
-    if estimated and extent < 1e3 * _SHORTEST:
-        raise ValueError(
-            f"{path}: the extent of its points is {extent:.3g} mm; give its unit "
-            "(mm_per_unit), or scale it"
-        )
-    if 0 < extent < 1e4 * resolved:
-        raise ValueError(
-            f"{path}: its points are {reach:.3g} mm from the origin, where single precision "
-            f"resolves {resolved:.2g} mm, and their extent is {extent:.3g} mm; move them to "
-            "the origin"
-        )
+    require(
+        extent >= 1e3 * _SHORTEST or not estimated,
+        path,
+        f"the extent of its points is {extent:.3g} mm; give its unit (mm_per_unit), or scale it",
+    )
+    require(
+        extent == 0 or extent >= 1e4 * resolved,
+        path,
+        f"its points are {reach:.3g} mm from the origin, where single precision resolves "
+        f"{resolved:.2g} mm, and their extent is {extent:.3g} mm; move them to the origin",
+    )
 
 
 def _values(

@@ -15,7 +15,7 @@ from splatjax.render import RenderSettings
 from splatjax.scene import Camera, EnvironmentLight, Material, Scene, Splats
 
 from ._cameras import load_camera, resized
-from ._files import StrPath
+from ._files import StrPath, require
 from ._images import read_manifest
 from ._lights import LIGHT_ENTRIES, PLACE, light_of, look_at, plain_light, write_image
 from ._materials import MATERIAL_TABLES, load_material, plain_material
@@ -89,11 +89,12 @@ def scene_table(path: StrPath) -> Table:
     else:
         record = {"scene": read_toml(path, "give the file of a scene, or a picture")}
     scene = record.get("scene")
-    if isinstance(scene, dict) and not scene.keys() & {*_TABLES}:
-        raise ValueError(
-            f"{path}: has no [splats], [camera] or [[lights]]; give the file of a scene, whose "
-            "`material` may be this one"
-        )
+    require(
+        not isinstance(scene, dict) or scene.keys() & {*_TABLES},
+        path,
+        "has no [splats], [camera] or [[lights]]; give the file of a scene, whose `material` may "
+        "be this one",
+    )
     table = Table(path, "", scene, _TABLES)
     table.entries.setdefault("settings", {})
     return table
@@ -139,11 +140,12 @@ def save_scene(
     """
     path, lights = Path(path), []
     plain = RenderSettings(bounces=settings.bounces, diffuser=settings.diffuser)
-    if not eqx.tree_equal(settings, plain) or settings.diffuser not in DIFFUSERS.values():
-        raise ValueError(
-            f"{path}: stores only bounces and a default ClusterDiffuser, ExitanceDiffuser or "
-            f"ShapeDiffuser; keep other settings in the program: {settings}"
-        )
+    require(
+        eqx.tree_equal(settings, plain) and settings.diffuser in DIFFUSERS.values(),
+        path,
+        "stores only bounces and a default ClusterDiffuser, ExitanceDiffuser or ShapeDiffuser; "
+        f"keep other settings in the program: {settings}",
+    )
     for number, light in enumerate(scene.lights, 1):
         image = path.with_name(f"{path.stem}_{number}.exr")
         lights.append(plain_light(light, image.name))

@@ -22,7 +22,7 @@ from splatjax._records import Numbers, check_values
 from splatjax.exports import plain_numbers
 from splatjax.scattering import Tabulated
 
-from ._files import StrPath, atomic_path, check_units, existing_file, naming
+from ._files import StrPath, atomic_path, check_units, existing_file, naming, require
 
 Made = TypeVar("Made")
 
@@ -51,8 +51,7 @@ class Table:
         self.path, self.name, self.entries = path, name, entries
         self.folder = path.parent  # folder of the files that the table names
         self.where = f"{path}: [{name}]" if name else f"{path}:"
-        if not isinstance(entries, dict):
-            raise ValueError(f"{self.where} must be a table; it is {entries!r}")
+        self.require(isinstance(entries, dict), f"must be a table; it is {entries!r}")
         unknown = sorted(entries.keys() - names)
         if unknown:
             raise ValueError(
@@ -66,20 +65,26 @@ class Table:
     def tables(self, name: str, names: Iterable[str]) -> "list[Table]":
         """Return a list of tables within this one; errors number them from 1."""
         value = self.entries.get(name)
-        if not isinstance(value, list) or not value:
-            raise ValueError(f"{self.where} {name} must be one table or more; it is {value!r}")
+        self.require(
+            isinstance(value, list) and value, f"{name} must be one table or more; it is {value!r}"
+        )
         return [
             Table(self.path, f"{self.name} {name} {number}".strip(), entries, names)
             for number, entries in enumerate(value, start=1)
         ]
 
+    def require(self, holds: Any, fault: str) -> None:
+        """Raise `ValueError` with the table and its fault unless a condition holds."""
+        if not holds:
+            raise ValueError(f"{self.where} {fault}")
+
     def one_of(self, name: str, choices: Iterable[Any], default: Any = None) -> Any:
         """Return an entry that is one of some choices."""
         value = self.entries.get(name, default)
-        if (type(value), value) not in [(type(choice), choice) for choice in choices]:
-            raise ValueError(
-                f"{self.where} {name} must be {' or '.join(map(repr, choices))}; it is {value!r}"
-            )
+        self.require(
+            (type(value), value) in [(type(choice), choice) for choice in choices],
+            f"{name} must be {' or '.join(map(repr, choices))}; it is {value!r}",
+        )
         return value
 
     def numbers(self, name: str, default: float | list[float] | None = None) -> Array:
@@ -99,14 +104,12 @@ class Table:
 
     def number(self, name: str, default: float | None = None) -> float:
         values = self.numbers(name, default)
-        if values.ndim:
-            raise ValueError(f"{self.where} {name} must be one number; it is {values.tolist()}")
+        self.require(values.ndim == 0, f"{name} must be one number; it is {values.tolist()}")
         return float(values)
 
     def text(self, name: str) -> str:
         value = self.entries.get(name)
-        if not isinstance(value, str):
-            raise ValueError(f"{self.where} {name} must be a name in quotes; it is {value!r}")
+        self.require(isinstance(value, str), f"{name} must be a name in quotes; it is {value!r}")
         return value
 
     def make(self, make: Callable[..., Made], *args: Any, **named: Any) -> Made:
@@ -206,16 +209,15 @@ def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
                     f"{where} gives the unit {unit}, and mm_per_unit is {mm_per_unit:g}; give "
                     f"mm_per_unit = {size:g} (--mm-per-unit {size:g}), or correct the unit"
                 )
-    if len(rows) < 2:
-        raise ValueError(f"{path}: has {len(rows)} lines of numbers; give at least two radii")
+    require(len(rows) >= 2, path, f"has {len(rows)} lines of numbers; give at least two radii")
     table, count = [], len(rows[0][1])
     for where, cells in rows:
         table.append([_number(cell) for cell in cells])
-        if not 1 < len(cells) == count or not np.isfinite(rounded(table[-1])).all():
-            raise ValueError(
-                f"{where}: {', '.join(cells)} must be a radius and a value for each of {count - 1} "
-                "channels"
-            )
+        require(
+            1 < len(cells) == count and np.isfinite(rounded(table[-1])).all(),
+            where,
+            f"{', '.join(cells)} must be a radius and a value for each of {count - 1} channels",
+        )
     radii, values = np.split(np.asarray(table), [1], axis=1)
     with naming(path):
         return Tabulated(
@@ -238,19 +240,21 @@ def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
     """
     contents = f"media are a CSV of {', '.join(_COLUMNS)}"
     (_, head), *rows = _read_rows(path, contents) or [("", [])]
-    if not set(head) >= set(_COLUMNS) or not rows:
-        raise ValueError(
-            f"{path}: has the columns {', '.join(head)}, with {len(rows)} rows; {contents}"
-        )
+    require(
+        set(head) >= set(_COLUMNS) and rows,
+        path,
+        f"has the columns {', '.join(head)}, with {len(rows)} rows; {contents}",
+    )
     names, media = [], []
     for where, cells in rows:
         entries = dict(zip(head, cells, strict=False))
         medium = np.asarray([_number(entries.get(name, "")) for name in _COLUMNS], float)
         is_valid = np.isfinite(medium).all() and medium[0] >= 0 and (medium[1:] > 0).all()
-        if len(cells) != len(head) or not is_valid:
-            raise ValueError(
-                f"{where}: {', '.join(cells)} must be {', '.join(head)}, positive; sigma_a may be 0"
-            )
+        require(
+            len(cells) == len(head) and is_valid,
+            where,
+            f"{', '.join(cells)} must be {', '.join(head)}, positive; sigma_a may be 0",
+        )
         names.append(entries.get("name") or str(len(media) + 1))
         media.append(medium)
     return names, np.asarray(media)

@@ -25,7 +25,7 @@ from splatjax.scene import (
 )
 
 from ._exchange import METERS, body_mesh, camera_pose, light_pose, strength
-from ._files import StrPath, atomic_path, naming
+from ._files import StrPath, atomic_path, check_suffix, naming
 from ._lights import write_image
 from ._materialx import openpbr_inputs
 
@@ -122,8 +122,7 @@ def save_usd(path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None =
     a material of neither one nor three channels; `OSError` if the file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() not in _SUFFIXES:
-        raise ValueError(f"{path}: the name of this file must end in {' or '.join(_SUFFIXES)}")
+    check_suffix(path, *_SUFFIXES)
     check_installed(f"{path}: USD", "pxr", "usd-core")
     from pxr import Usd
 
