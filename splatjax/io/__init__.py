@@ -1,5 +1,10 @@
 """Reads and writes files of splats, meshes, pictures and materials."""
 
+from splatjax._display import (
+    linear_to_srgb as linear_to_srgb,
+    srgb_to_linear as srgb_to_linear,
+)
+
 from ._files import (
     atomic_path as atomic_path,
     fingerprint as fingerprint,
@@ -9,11 +14,9 @@ from ._files import (
     write_record as write_record,
 )
 from ._images import (
-    linear_to_srgb as linear_to_srgb,
     read_exr as read_exr,
     read_manifest as read_manifest,
     read_picture as read_picture,
-    srgb_to_linear as srgb_to_linear,
     write_animation as write_animation,
     write_exr as write_exr,
     write_png as write_png,

@@ -1,7 +1,8 @@
-"""Checks before a file is opened (existence, unit), atomic writing, and JSON records of the
-settings of a file.
+"""Checks before a file is opened (existence, unit), atomic writing, JSON records of the settings of
+a file, and records as tables of plain numbers.
 """
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -14,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from splatjax.exports import data_sheet
+from splatjax.exports import data_sheet, plain_numbers
 from splatjax.scene import Material
 
 StrPath: TypeAlias = str | os.PathLike[str]
@@ -139,6 +140,19 @@ def read_record(path: StrPath) -> dict[str, Any]:
         ) from None
     require(isinstance(record, dict), path, "is not a record; delete it, or give another folder")
     return record
+
+
+def record_names(cls: Any) -> list[str]:
+    """Return the names of the fields with which records of a class are made."""
+    return [field.name for field in dataclasses.fields(cls) if field.init]
+
+
+def plain_record(record: Any, **given: Any) -> dict[str, Any]:
+    """Return the table of a record, which `Table.record` reads: the fields that are not `None`,
+    except for the given ones, as plain numbers.
+    """
+    values = {name: getattr(record, name) for name in record_names(record)} | given
+    return {name: plain_numbers(value) for name, value in values.items() if value is not None}
 
 
 def save_exports(material: Material, path: StrPath) -> None:

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from splatjax._display import srgb_to_linear
 from splatjax._records import check_installed
 from splatjax.geometry import estimate_normals
-
-from ._images import srgb_to_linear
 
 _PLACES, _COLORS = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")

@@ -19,7 +19,7 @@ from splatjax.scene import (
 )
 
 from ._exchange import METERS, body_mesh, camera_pose, light_pose, strength
-from ._files import StrPath, atomic_path, check_suffix, naming
+from ._files import StrPath, atomic_path, check_suffix
 from ._materialx import check_colors
 
 _LIGHTS = "KHR_lights_punctual"
@@ -91,9 +91,11 @@ def save_gltf(
         aspect = camera.width / camera.height
         yfov = 2 * np.arctan(0.5 / float(camera.focal_length))
         lens = {"yfov": float(yfov), "aspectRatio": aspect, "znear": METERS * float(camera.near)}
-        nodes = [{"name": "camera", "camera": 0, "matrix": _matrix(camera_pose(camera))}]
+        # Matrices are stored column by column.
+        matrix = camera_pose(camera).T.ravel().tolist()
+        nodes: list[dict[str, Any]] = [{"name": "camera", "camera": 0, "matrix": matrix}]
         for number, light in enumerate(named):
-            node = {"name": f"light {number + 1}", "matrix": _matrix(light_pose(light))}
+            node = {"name": f"light {number + 1}", "matrix": light_pose(light).T.ravel().tolist()}
             nodes.append(node | {"extensions": {_LIGHTS: {"light": number}}})
         first = len(tree["nodes"])
         tree["nodes"] += nodes
@@ -112,8 +114,7 @@ def save_gltf(
 
 
 def _material(path: StrPath, material: Material, has_albedo: bool, thickness: float) -> Any:
-    with naming(path):
-        check_colors(material)
+    check_colors(path, material)
     distance, attenuation, scattered = map(np.asarray, gltf_volume(material))
     total = np.asarray(material.total_reflectance())
     color = np.ones(3) if has_albedo else np.broadcast_to(total, 3)
@@ -158,7 +159,3 @@ def _light(light: AbstractLight, lux: float) -> dict[str, Any]:
         angles = np.radians([light.inner_angle, light.outer_angle]).tolist()
         entry["spot"] = dict(zip(("innerConeAngle", "outerConeAngle"), angles, strict=True))
     return entry
-
-
-def _matrix(pose: np.ndarray) -> list[float]:
-    return pose.T.ravel().tolist()  # column by column

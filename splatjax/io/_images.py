@@ -13,7 +13,7 @@ import OpenEXR  # ty: ignore[import-not-found]
 from jaxtyping import Array, Float
 from PIL import Image
 
-from splatjax._display import linear_to_srgb as linear_to_srgb, png_of, to_display
+from splatjax._display import png_of, srgb_to_linear, to_display
 from splatjax._memory import check_memory
 from splatjax.scene import Camera, Frame
 
@@ -97,18 +97,9 @@ def read_color(path: StrPath) -> Float[np.ndarray, "height width 3"]:
 def _colors(path: StrPath) -> tuple[Float[np.ndarray, "height width _"], bool]:
     planes, _, is_linear = read_planes(path)
     names = "RGB" if "R" in planes else "Y"
-    require(
-        planes.keys() >= set(names),
-        path,
-        f"has neither R, G and B nor Y; it has {', '.join(planes)}",
-    )
+    require(planes.keys() >= {*names}, path, f"has neither R, G and B nor Y: {', '.join(planes)}")
     with np.errstate(invalid="ignore"):  # of NaN that signals
         return np.stack([planes[name] for name in names], axis=-1).astype(np.float64), is_linear
-
-
-def srgb_to_linear(encoded: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Decode sRGB values in [0, 1] to linear light."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def write_png(
@@ -230,20 +221,21 @@ def write_exr(
     check_suffix(path, ".exr")
     from splatjax import __version__  # defined only after the whole package is imported
 
-    gaussians, channels = frame.weights.shape
+    weights = np.asarray(frame.weights, np.float32)
+    gaussians, channels = weights.shape
     header: dict[str, Any] = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "software": f"splatjax {__version__}",
         "comments": "Linear light; mm. Depth, position and normal are not premultiplied.",
-        "splatjax.unresolved_fraction": _floats(frame.unresolved_fraction),
+        "splatjax.unresolved_fraction": np.asarray(frame.unresolved_fraction, np.float32).tolist(),
         "splatjax.overflow": float(frame.overflow),
-        **{f"{_WEIGHTS}{k}": _floats(row) for k, row in enumerate(np.asarray(frame.weights), 1)},
+        **{f"{_WEIGHTS}{k}": row.tolist() for k, row in enumerate(weights, 1)},
     }
     if channels == 3:
         header |= {"chromaticities": _REC709_D65, "colorInteropID": "lin_rec709_scene"}
     if variances is not None:
-        header[_VARIANCES] = _floats(variances)
+        header[_VARIANCES] = np.asarray(variances, np.float32).tolist()
     if manifest is not None:
         header[_MANIFEST] = json.dumps(manifest)
     if camera is not None:
@@ -333,7 +325,3 @@ def _layout(channels: int, lights: int, gaussians: int, has_single: bool) -> dic
         ),
     }
     return {field: np.asarray(names) for field, names in layout.items()}
-
-
-def _floats(values: Any) -> list[float]:
-    return [float(value) for value in np.asarray(values, np.float32)]

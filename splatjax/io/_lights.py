@@ -27,9 +27,18 @@ from splatjax.scene import (
 )
 
 from ._cameras import gltf_nodes
-from ._files import StrPath, atomic_path, check_units, existing_file, naming, with_y_up
+from ._files import (
+    StrPath,
+    atomic_path,
+    check_units,
+    existing_file,
+    naming,
+    plain_record,
+    record_names,
+    with_y_up,
+)
 from ._images import read_picture
-from ._tables import Table, plain_record, read_toml, record_names
+from ._tables import Table, read_toml
 from ._trimesh import one_sentence
 
 PLACE = ("position", "target", "up", "fov")
@@ -161,9 +170,10 @@ def picture_paths(path: StrPath) -> list[Path]:
 
 
 def _observation(table: Table) -> Observation:
-    picture = _picture(table, "file")
-    has_mask, deviation = "mask" in table.entries, None
-    mask = np.any(_picture(table, "mask") > 0, axis=-1) if has_mask else None
+    picture = table.make(read_picture, table.folder / table.text("file"))
+    mask = deviation = None
+    if "mask" in table.entries:
+        mask = np.any(table.make(read_picture, table.folder / table.text("mask")) > 0, axis=-1)
     if "noise" in table.entries:
         noise = table.numbers("noise")
         table.make(check_values, "noise", noise, "positive", lambda x: x > 0)
@@ -210,11 +220,6 @@ def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
             even = even_directions(len(directions)).astype(directions.dtype)
             given["directions"] = len(even) if np.array_equal(directions, even) else directions
     return {"kind": kinds[type(light)]} | plain_record(light, **given)
-
-
-def _picture(table: Table, name: str) -> np.ndarray:
-    with naming(f"{table.where} {name}"):
-        return read_picture(table.folder / table.text(name))
 
 
 def light_of(table: Table, channels: int) -> AbstractLight:

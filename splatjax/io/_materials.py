@@ -26,7 +26,7 @@ from splatjax.scattering import (
 )
 from splatjax.scene import Material
 
-from ._files import StrPath, naming, require
+from ._files import StrPath, naming, plain_record, record_names, require
 from ._media import (
     LAYER_ENTRIES,
     MEDIUM_ENTRIES,
@@ -37,7 +37,7 @@ from ._media import (
     plain_medium,
     plain_openpbr,
 )
-from ._tables import Table, nearest, plain_record, read_toml, record_names, write_toml
+from ._tables import Table, nearest, read_toml, write_toml
 
 VARIANCE_UNIT = "mm^2"
 _KINDS = {"medium": "[medium]", "openpbr": "[openpbr]", "layers": "[[layers]]", "skin": "[skin]"}

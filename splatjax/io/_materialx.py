@@ -9,7 +9,7 @@ import numpy as np
 from splatjax.exports import openpbr_subsurface, plain_numbers
 from splatjax.scene import Material
 
-from ._files import StrPath, atomic_path, check_units, naming
+from ._files import StrPath, atomic_path, check_units, require
 
 _SURFACE, _MATERIAL = "openpbr", "material"
 
@@ -30,8 +30,7 @@ def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.
     cannot be written.
     """
     check_units(path, mm_per_unit)
-    with naming(path):
-        inputs = openpbr_inputs(material, mm_per_unit)
+    inputs = openpbr_inputs(path, material, mm_per_unit)
     root = ElementTree.Element("materialx", version="1.39", colorspace="lin_rec709")
     surface = ElementTree.SubElement(root, "open_pbr_surface", name=_SURFACE, type="surfaceshader")
     for name, values in inputs.items():
@@ -47,18 +46,18 @@ def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
 
 
-def check_colors(material: Material) -> None:
+def check_colors(path: StrPath, material: Material) -> None:
     """Raise `ValueError` for a material that has neither one nor three channels."""
-    if material.channels not in (1, 3):
-        raise ValueError(f"the material has {material.channels} channels; give one of 1 or 3")
+    fault = f"the material has {material.channels} channels; give one of 1 or 3"
+    require(material.channels in (1, 3), path, fault)
 
 
-def openpbr_inputs(material: Material, mm_per_unit: float) -> dict[str, list[float]]:
-    """Return the inputs of an OpenPBR surface, one or three numbers each.
+def openpbr_inputs(path: StrPath, material: Material, mm_per_unit: float) -> dict[str, list[float]]:
+    """Return the inputs of an OpenPBR surface in a file, one or three numbers each.
 
     **Raises:** `ValueError` for a material of another number of channels.
     """
-    check_colors(material)
+    check_colors(path, material)
     inputs = openpbr_subsurface(material)
     inputs["subsurface_radius"] /= mm_per_unit
     inputs |= {

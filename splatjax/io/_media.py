@@ -9,7 +9,8 @@ import numpy as np
 from splatjax._records import check_values
 from splatjax.scattering import Film, HalfSpace, Layer, Medium
 
-from ._tables import Table, plain_record
+from ._files import plain_record
+from ._tables import Table
 
 COEFFICIENT_UNIT, THICKNESS_UNIT = "1/mm", "mm"
 _PER_MM = {COEFFICIENT_UNIT: 1.0, "1/cm": 0.1}

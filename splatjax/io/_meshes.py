@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax._display import srgb_to_linear
 from splatjax._memory import check_memory
 from splatjax.geometry import (
     Mesh,
@@ -23,7 +24,7 @@ from splatjax.geometry import (
 from splatjax.scene import Splats
 
 from ._files import StrPath, check_units, existing_file, naming, require, with_y_up
-from ._images import read_color, read_map, srgb_to_linear
+from ._images import read_color, read_map
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
 _LUMA = np.asarray([0.299, 0.587, 0.114])  # of encoded color, Rec. 601

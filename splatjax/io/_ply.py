@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from splatjax._display import srgb_to_linear
 from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
 from ._files import StrPath, atomic_path, check_units, existing_file, naming, require, with_y_up
 from ._gaussian_scenes import GAUSSIAN_COLUMNS, spz_columns, surface_columns
-from ._images import srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
 _SHORTEST, _LONGEST = 1e-9, 1e9  # mm; outside this range, single precision loses areas

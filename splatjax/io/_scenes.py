@@ -15,13 +15,13 @@ from splatjax.render import RenderSettings
 from splatjax.scene import Camera, EnvironmentLight, Material, Scene, Splats
 
 from ._cameras import load_camera, resized
-from ._files import StrPath, require
+from ._files import StrPath, plain_record, record_names, require
 from ._images import read_manifest
 from ._lights import LIGHT_ENTRIES, PLACE, light_of, look_at, plain_light, write_image
 from ._materials import MATERIAL_TABLES, load_material, plain_material
 from ._meshes import read_textured_mesh, sample_mesh
 from ._ply import read_splats, write_splats
-from ._tables import Table, plain_record, read_toml, record_names, write_toml
+from ._tables import Table, read_toml, write_toml
 
 DIFFUSERS = {
     "clusters": ClusterDiffuser(),

@@ -19,7 +19,6 @@ import tomli_w
 from jaxtyping import Array, Float
 
 from splatjax._records import Numbers, check_values
-from splatjax.exports import plain_numbers
 from splatjax.scattering import Tabulated
 
 from ._files import StrPath, atomic_path, check_units, existing_file, naming, require
@@ -135,19 +134,6 @@ class Table:
             return kind(self.number(name))
         is_scalar = getattr(kind, "dim_str", None) == ""
         return self.number(name) if is_scalar else self.numbers(name)
-
-
-def record_names(cls: Any) -> list[str]:
-    """Return the names of the fields with which records of a class are made."""
-    return [field.name for field in dataclasses.fields(cls) if field.init]
-
-
-def plain_record(record: Any, **given: Any) -> dict[str, Any]:
-    """Return the table of a record, which `Table.record` reads: the fields that are not `None`,
-    except for the given ones, as plain numbers.
-    """
-    values = {name: getattr(record, name) for name in record_names(record)} | given
-    return {name: plain_numbers(value) for name, value in values.items() if value is not None}
 
 
 def write_toml(path: StrPath, tables: Mapping[str, Any]) -> None:

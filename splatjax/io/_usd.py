@@ -25,7 +25,7 @@ from splatjax.scene import (
 )
 
 from ._exchange import METERS, body_mesh, camera_pose, light_pose, strength
-from ._files import StrPath, atomic_path, check_suffix, naming
+from ._files import StrPath, atomic_path, check_suffix
 from ._lights import write_image
 from ._materialx import openpbr_inputs
 
@@ -128,8 +128,7 @@ def save_usd(path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None =
 
     body = body_mesh(scene.splats, mesh)
     has_albedo = body.colors is not None
-    with naming(path):
-        openpbr, preview = _surfaces(openpbr_inputs(scene.material, 1 / METERS), has_albedo)
+    openpbr, preview = _surfaces(openpbr_inputs(path, scene.material, 1 / METERS), has_albedo)
     text = _SCENE.substitute(
         openpbr=openpbr,
         preview=preview,
