@@ -45,7 +45,7 @@ PLACE = ("position", "target", "up", "fov")
 _MOST_ROWS = 512  # largest number of rows of an environment
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
 ENVIRONMENTS = {"studio": studio, "overcast": overcast_sky, "sun": sun_and_sky}
-_LIGHTS = {
+_LIGHTS: dict[str, type[AbstractLight]] = {
     "directional": DirectionalLight,
     "point": PointLight,
     "spot": SpotLight,

@@ -116,7 +116,7 @@ class Table:
         with naming(self.where.rstrip(":")):
             return make(*args, **named)
 
-    def record(self, cls: Callable[..., Made], **given: Any) -> Made:
+    def record(self, cls: Any, **given: Any) -> Any:
         """Make a record of a class from the entries of its fields, except for the given ones. A
         missing entry is the default of its field.
         """

@@ -176,11 +176,11 @@ def _set_triangles(prim: Any, body: Mesh) -> None:
 def _surfaces(inputs: Mapping[str, list[float]], has_albedo: bool) -> tuple[str, str]:
     """Return the inputs of OpenPBR, and of an opaque surface for renderers that lack it."""
     values = {name: v[0] if len(v) == 1 else tuple(v) for name, v in inputs.items()}
-    mtlx = {
+    mtlx: dict[str, Any] = {
         f"{'float' if isinstance(value, float) else 'color3f'} inputs:{name}": value
         for name, value in values.items()
     }
-    plain = {
+    plain: dict[str, Any] = {
         "color3f inputs:diffuseColor": values["subsurface_color"],
         "float inputs:roughness": values["specular_roughness"],
         "float inputs:ior": values["specular_ior"],
@@ -212,25 +212,25 @@ def _camera(camera: Camera) -> str:
 
 def _light(path: Path, number: int, light: AbstractLight) -> str:
     greatest, color = strength(light)
-    kind, schemas, attributes = type(light).__name__, "", dict[str, Any]()
+    kind, schemas, cone = type(light).__name__, "", dict[str, Any]()
     match light:
         case DirectionalLight():
-            kind, attributes = "DistantLight", {"float inputs:angle": 0, "bool inputs:normalize": 1}
+            kind, entries = "DistantLight", {"float inputs:angle": 0, "bool inputs:normalize": 1}
         case PointLight() | SpotLight():  # a sphere of 1 mm whose radiance gives the intensity
-            kind, attributes = "SphereLight", {"float inputs:radius": METERS}
+            kind, entries = "SphereLight", {"float inputs:radius": METERS}
             greatest /= np.pi
         case SphereLight() | DiskLight():
-            attributes = {"float inputs:radius": METERS * float(light.radius)}
+            entries = {"float inputs:radius": METERS * float(light.radius)}
         case RectangleLight():
             edges = METERS * np.linalg.norm(np.asarray(light.edges, float), axis=1)
             height, width = edges.tolist()
             kind = "RectLight"
-            attributes = {"float inputs:width": width, "float inputs:height": height}
+            entries = {"float inputs:width": width, "float inputs:height": height}
         case EnvironmentLight():
             image = path.with_name(f"{path.stem}_{number}.exr")
             write_image(image, light.image)
-            kind, attributes = "DomeLight", {"asset inputs:texture:file": f"@@@{image.name}@@@"}
-            attributes["token inputs:texture:format"] = '"latlong"'
+            kind, entries = "DomeLight", {"asset inputs:texture:file": f"@@@{image.name}@@@"}
+            entries["token inputs:texture:format"] = '"latlong"'
         case _:
             warnings.warn(
                 f"{path}: USD has no {kind}, and is written without it; give another light",
@@ -240,12 +240,15 @@ def _light(path: Path, number: int, light: AbstractLight) -> str:
     if isinstance(light, SpotLight):
         inner, outer = float(light.inner_angle), float(light.outer_angle)
         schemas = 'prepend apiSchemas = ["ShapingAPI"]'
-        attributes["float inputs:shaping:cone:angle"] = outer
-        attributes["float inputs:shaping:cone:softness"] = 1 - inner / outer
-    attributes |= {"float inputs:intensity": greatest, "color3f inputs:color": tuple(color)}
+        cone["float inputs:shaping:cone:angle"] = outer
+        cone["float inputs:shaping:cone:softness"] = 1 - inner / outer
+    attributes = {
+        **entries,
+        **cone,
+        "float inputs:intensity": greatest,
+        "color3f inputs:color": tuple(color),
+        **_placed(light_pose(light)),
+    }
     return _LIGHT.substitute(
-        kind=kind,
-        number=number,
-        schemas=schemas,
-        attributes=_lines(attributes | _placed(light_pose(light))),
+        kind=kind, number=number, schemas=schemas, attributes=_lines(attributes)
     )
