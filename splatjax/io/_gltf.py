@@ -91,12 +91,15 @@ def save_gltf(
         aspect = camera.width / camera.height
         yfov = 2 * np.arctan(0.5 / float(camera.focal_length))
         lens = {"yfov": float(yfov), "aspectRatio": aspect, "znear": METERS * float(camera.near)}
-        # Matrices are stored column by column.
-        matrix = camera_pose(camera).T.ravel().tolist()
-        nodes: list[dict[str, Any]] = [{"name": "camera", "camera": 0, "matrix": matrix}]
-        for number, light in enumerate(named):
-            node = {"name": f"light {number + 1}", "matrix": light_pose(light).T.ravel().tolist()}
-            nodes.append(node | {"extensions": {_LIGHTS: {"light": number}}})
+        nodes = [{"name": "camera", "camera": 0, "matrix": _matrix(camera_pose(camera))}]
+        nodes += [
+            {
+                "name": f"light {number + 1}",
+                "matrix": _matrix(light_pose(light)),
+                "extensions": {_LIGHTS: {"light": number}},
+            }
+            for number, light in enumerate(named)
+        ]
         first = len(tree["nodes"])
         tree["nodes"] += nodes
         tree["scenes"][0]["nodes"] += range(first, first + len(nodes))
@@ -159,3 +162,7 @@ def _light(light: AbstractLight, lux: float) -> dict[str, Any]:
         angles = np.radians([light.inner_angle, light.outer_angle]).tolist()
         entry["spot"] = dict(zip(("innerConeAngle", "outerConeAngle"), angles, strict=True))
     return entry
+
+
+def _matrix(pose: np.ndarray) -> list[float]:
+    return pose.T.ravel().tolist()  # column by column

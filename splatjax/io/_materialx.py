@@ -1,7 +1,7 @@
 """Materials as MaterialX documents, in the terms of OpenPBR."""
 
 from pathlib import Path
-from xml.etree import ElementTree
+from string import Template
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,16 @@ from splatjax.scene import Material
 
 from ._files import StrPath, atomic_path, check_units, require
 
-_SURFACE, _MATERIAL = "openpbr", "material"
+_DOCUMENT = Template("""<?xml version='1.0' encoding='utf-8'?>
+<materialx version="1.39" colorspace="lin_rec709">
+  <open_pbr_surface name="openpbr" type="surfaceshader">
+    $inputs
+  </open_pbr_surface>
+  <surfacematerial name="material" type="material">
+    <input name="surfaceshader" type="surfaceshader" nodename="openpbr" />
+  </surfacematerial>
+</materialx>
+""")
 
 
 def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.0) -> None:
@@ -31,19 +40,14 @@ def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.
     """
     check_units(path, mm_per_unit)
     inputs = openpbr_inputs(path, material, mm_per_unit)
-    root = ElementTree.Element("materialx", version="1.39", colorspace="lin_rec709")
-    surface = ElementTree.SubElement(root, "open_pbr_surface", name=_SURFACE, type="surfaceshader")
+    lines = []
     for name, values in inputs.items():
         kind = "float" if len(values) == 1 else "color3"
         text = ", ".join(map(str, values))
-        ElementTree.SubElement(surface, "input", name=name, type=kind, value=text)
-    shown = ElementTree.SubElement(root, "surfacematerial", name=_MATERIAL, type="material")
-    ElementTree.SubElement(
-        shown, "input", name="surfaceshader", type="surfaceshader", nodename=_SURFACE
-    )
-    ElementTree.indent(root)
+        lines.append(f'<input name="{name}" type="{kind}" value="{text}" />')
     with atomic_path(Path(path)) as temporary:
-        ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
+        document = _DOCUMENT.substitute(inputs="\n    ".join(lines))
+        temporary.write_text(document, encoding="utf-8")
 
 
 def check_colors(path: StrPath, material: Material) -> None:

@@ -207,10 +207,7 @@ class SplatFile:
             rows = self._rows(begin, min(self.part, self.count - begin))
             where = self.path.with_name(f"{self.path.name}, from vertex {begin}")
             columns: dict[str, np.ndarray] = {name: rows[name] for name in self._names}
-            try:
-                fields = _splat_fields(where, columns, self.mm_per_unit, self.up)
-            except ValueError as error:
-                raise ValueError(f"{error}; or {_COMPLETE}") from None
+            fields = _splat_fields(where, columns, self.mm_per_unit, self.up)
             corners += [fields["centers"].min(axis=0), fields["centers"].max(axis=0)]
             yield Splats(**fields)
         _check_places(self.path, np.stack(corners), estimated=False)

@@ -85,10 +85,9 @@ def scene_table(path: StrPath) -> Table:
     """Return the contents of a scene's file, or of the manifest of a picture."""
     path = Path(path)
     if path.suffix.lower() == ".exr":
-        record = read_manifest(path)
+        scene = read_manifest(path).get("scene")
     else:
-        record = {"scene": read_toml(path, "give the file of a scene, or a picture")}
-    scene = record.get("scene")
+        scene = read_toml(path, "give the file of a scene, or a picture")
     require(
         not isinstance(scene, dict) or scene.keys() & {*_TABLES},
         path,
