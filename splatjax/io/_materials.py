@@ -268,6 +268,7 @@ def _read(
     require(
         kinds or "fit" in entries, path, f"has no {', '.join(_KINDS.values())} or [fit]; give one"
     )
+    entries.setdefault("surface", {})
     table = tables.table("surface", _SURFACE)
     surface = {name: table.numbers(name) for name in table.entries}
     table.make(Material, SumOfGaussians([1.0], [[1.0]]), **surface)  # checks them

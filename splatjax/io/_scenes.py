@@ -103,7 +103,7 @@ def material_of_scene(file: Table) -> StrPath | Table:
     """Return the name, path or tables of the material in a scene's file."""
     name = file.entries.get("material")
     if not isinstance(name, str):
-        return Table(file.path, "material", name, MATERIAL_TABLES)
+        return file.table("material", MATERIAL_TABLES)
     return file.folder / name if Path(name).suffix else name
 
 

@@ -58,8 +58,7 @@ class Table:
             )
 
     def table(self, name: str, names: Iterable[str]) -> "Table":
-        """Return a table within this one, empty if there is none."""
-        return Table(self.path, f"{self.name} {name}".strip(), self.entries.get(name, {}), names)
+        return Table(self.path, f"{self.name} {name}".strip(), self.entries.get(name), names)
 
     def tables(self, name: str, names: Iterable[str]) -> "list[Table]":
         """Return a list of tables within this one; errors number them from 1."""
