@@ -91,7 +91,8 @@ def save_gltf(
         aspect = camera.width / camera.height
         yfov = 2 * np.arctan(0.5 / float(camera.focal_length))
         lens = {"yfov": float(yfov), "aspectRatio": aspect, "znear": METERS * float(camera.near)}
-        nodes = [{"name": "camera", "camera": 0, "matrix": _matrix(camera_pose(camera))}]
+        pose = _matrix(camera_pose(camera))
+        nodes: list[dict[str, Any]] = [{"name": "camera", "camera": 0, "matrix": pose}]
         nodes += [
             {
                 "name": f"light {number + 1}",
