@@ -33,12 +33,9 @@ class Body:
         self.settings = settings
         self.is_blended = eqx.tree_equal(settings, RenderSettings())
         self.kept: dict[str, tuple[Hashable, Any]] = {}
-        environments = [light for light in lights if isinstance(light, EnvironmentLight)]
-        self.is_in_environments = len(environments) == len(lights)
+        self.is_in_environments = all(isinstance(light, EnvironmentLight) for light in lights)
         # Directions that do not turn with the image keep their shadows.
-        self.keeps_shadows = self.is_in_environments and all(
-            light.directions is not None for light in environments
-        )
+        self.keeps_shadows = all(getattr(light, "directions", None) is not None for light in lights)
 
     def has(self, kind: str, depends_on: Hashable) -> bool:
         return self.kept.get(kind, (None,))[0] == depends_on

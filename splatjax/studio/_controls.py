@@ -11,7 +11,6 @@ from splatjax.scattering import Skin
 from splatjax.scene import AbstractLight, Camera, EnvironmentLight, Scene
 
 LAYERS = ("beauty", "diffuse", "specular", "albedo", "irradiance", "shadow")
-SURFACE = ("eta", "specular", "roughness")
 # The coefficients of a medium and the parameters of a skin that have sliders.
 COEFFICIENTS = {"sigma_a": "absorption", "sigma_s_prime": "scattering"}
 PIGMENTS = ("melanin", "blood", "oxygenation", "eumelanin", "bilirubin", "thickness", "scattering")

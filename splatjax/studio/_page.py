@@ -2,10 +2,11 @@
 compiles, so that the page stays responsive.
 """
 
-import contextlib
 import io
+import itertools
 import threading
 from collections.abc import Sequence
+from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -13,32 +14,25 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from splatjax._display import to_display
+from splatjax._format import CHANNEL_COLORS
 from splatjax._records import check_installed
-from splatjax.cache import watched_compiling
 from splatjax.inverse import Observation
 from splatjax.scattering import Medium
 
-from ._controls import Controls
-from ._panel import Panel
-from ._saving import SUFFIXES, AsFile, save
+from ._controls import LAYERS, Controls
+from ._saving import SUFFIXES, AsFile
 from ._search import Search
 from ._session import Session
-from ._sliders import (
-    COMPILING,
-    STILL,
-    UNSEEN,
-    controls_of,
-    pixel_rows,
-    sentence_of,
-    values_of_medium,
-)
+from ._sliders import coefficient_lines, sliders, values_of_medium
+from ._viewer import Viewer
 
 _NEAR = 1e-5  # relative, of cameras that are the same
 _QUALITY = 92  # of JPEG
+_UNPICKED = "click the picture for the parts of a pixel"
 _LEFT = 0.2  # share of the free width on the left of the picture; the controls are on the right
 
 
-class Page:
+class Page(Viewer):
     """A session in a browser, or at the end of a notebook's cell. All open pages show the same
     picture, from the camera that was moved last.
 
@@ -72,18 +66,15 @@ class Page:
         check_installed("the page of the studio", "viser")
         import viser
 
+        super().__init__(session, folder, as_file)
         if folder.exists() and not folder.is_dir():
             raise ValueError(f"{folder} is a file; give a folder for what the page saves")
-        folder.mkdir(exist_ok=True)
-        self._session, self._folder, self._as_file = session, folder, as_file
         self._saves = list[tuple[str, Controls]]()
         self._observations = observations
-        self._place = np.asarray([session.start.eye, session.start.target])
-        self._picked: tuple[int, int] | None = None
         self._image, self._joined = Image.new("RGB", (1, 1)), list[Any]()
         self._changed, self._closed = threading.Event(), threading.Event()
         self._looking = threading.Lock()
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints an address of its own
+        with redirect_stdout(io.StringIO()):  # it prints an address of its own
             self._server = server = viser.ViserServer(host, port, "splatjax", verbose=False)
         # Viser would give the page a public address on a server of others.
         server.request_share_url = lambda verbose=True: None
@@ -112,6 +103,9 @@ class Page:
         self._worker.join()
         self._server.stop()
 
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{self.url}" style="width: 100%; height: 600px; border: 0"></iframe>'
+
     def _add_controls(self, gui: Any) -> None:
         gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         self._status = gui.add_markdown("starting ...")
@@ -119,11 +113,50 @@ class Page:
         gui.add_button_group("save", tuple(SUFFIXES)).on_click(
             lambda event: self._change(event.target.value)
         )
-        self._panel = Panel(gui, self._session, self._change)
-        self._pixel = gui.add_markdown("click the picture for the parts of a pixel")
+        self._add_sliders(gui)
+        self._numbers, self._pixel = gui.add_markdown(""), gui.add_markdown(_UNPICKED)
         if self._observations:
             self._add_search(gui)
-        self._panel.add_plot(gui)
+        self._add_plot(gui)
+
+    def _add_sliders(self, gui: Any) -> None:
+        self._handles["layer"] = gui.add_dropdown("layer", LAYERS)
+        for folder, of_folder in itertools.groupby(sliders(self._session), lambda one: one.folder):
+            is_open = folder == "skin"
+            with gui.add_folder(folder, expand_by_default=is_open) if folder else nullcontext():
+                for name, label, low, high, value, _, step in of_folder:
+                    self._handles[name] = gui.add_slider(label, low, high, step, value)
+
+        def moved(event: Any) -> None:
+            handle = event.target
+            if hasattr(handle, "min"):  # its box takes any number
+                handle.value = min(max(handle.value, handle.min), handle.max)
+            self._change()
+
+        for handle in self._handles.values():
+            handle.on_update(moved)
+
+    def _add_plot(self, gui: Any) -> None:
+        """Add the drawing of the profile and its fit."""
+        curves, channels = (
+            self._session.curves(self._session.start),
+            self._session.own.material.channels,
+        )
+        profiles, hidden = len(curves) - 1 - channels, {"points": {"show": False}}
+        series = [
+            {"stroke": CHANNEL_COLORS[i % channels % 3] + opacity, "width": width, **hidden}
+            for i in range(profiles + channels)
+            for opacity, width in [("60", 6) if i < profiles else ("", 1.5)]
+        ]
+        ends = float(curves[0][0]), float(curves[0][-1])
+        self._plot = gui.add_uplot(
+            tuple(curves),
+            ({"label": "r"}, *series),
+            title="r R(r) over r in mm, and its fit (narrow)",
+            scales={"x": {"time": False, "distr": 3, "range": ends}},
+            legend={"show": False},
+            aspect=1.8,
+        )
 
     def _add_search(self, gui: Any) -> None:
         self._search = Search(self._session, self._observations, self._follow)
@@ -136,7 +169,7 @@ class Page:
 
         def press(event: Any) -> None:
             if event.target.value == "start":
-                self._search.start(self._controls())
+                self._search.start(self.controls)
             else:
                 self._search.stop()
 
@@ -146,30 +179,19 @@ class Page:
         """Show a stage of the search, and move the sliders to its medium."""
         self._stage.content = f"```\n{stage}\n```"
         if medium is not None:
-            self._panel.move(values_of_medium(self._session.start, medium))
-
-    def _compare(self, picture: np.ndarray) -> None:
-        """Show the first picture beside half its difference from the rendered one."""
-        difference = 128 + (picture.astype(int) - self._target) // 2
-        self._compared.image = np.hstack([self._target, difference.astype(np.uint8)])
-
-    def _repr_html_(self) -> str:
-        return f'<iframe src="{self.url}" style="width: 100%; height: 600px; border: 0"></iframe>'
+            for name, value in values_of_medium(self._session.start, medium).items():
+                self._handles[name].value = value
 
     def _look_again(self) -> None:
         """Move the cameras of all pages to the first view."""
-        start = self._session.start
         for client in self._joined:
-            client.camera.position, client.camera.look_at = start.eye, start.target
+            client.camera.position, client.camera.look_at = self._first_place
 
     def _change(self, *saves: str) -> None:
         if saves:
-            self._status.content = "saving ..."
-        self._saves += [(kind, self._controls()) for kind in saves]
+            self._say("saving ...")
+        self._saves += [(kind, self.controls) for kind in saves]
         self._changed.set()
-
-    def _controls(self) -> Controls:
-        return controls_of(self._session.start, self._panel.values, self._place)
 
     def _join(self, client: Any) -> None:
         def look(camera: Any) -> None:
@@ -179,11 +201,11 @@ class Page:
         client.camera.on_update(look)
 
     def _look(self, camera: Any) -> None:
-        place, start = np.asarray([camera.position, camera.look_at]), self._session.start
+        place = np.asarray([camera.position, camera.look_at])
         near = _NEAR * np.linalg.norm(place[0] - place[1])
         if camera.client not in self._joined:
             # At first viser sends cameras of its own, and then the one that the page starts with.
-            if np.max(np.abs(place - [start.eye, start.target])) < near:
+            if np.max(np.abs(place - self._first_place)) < near:
                 self._joined.append(camera.client)
                 camera.position, camera.look_at = self._place
             self._send(camera.client)
@@ -200,18 +222,21 @@ class Page:
         column, row = int(x * width - round(_LEFT * (width - camera.width))), int(y * height)
         is_inside = 0 <= column < camera.width and row < camera.height
         self._picked = (column, row) if is_inside else None
-        self._pixel.content = f"pixel {column}, {row} ..." if is_inside else ""
+        self._pixel.content = f"pixel {column}, {row} ..." if is_inside else _UNPICKED
         self._change()
 
-    def _take_apart(self, controls: Controls) -> str:
-        """Tabulate the parts of the chosen pixel."""
-        if self._picked is None:
-            return "click the picture for the parts of a pixel"
-        titles, *rows = pixel_rows(self._session, controls, self._picked)
-        if not rows:
-            return titles[0]
-        rows = [titles, ["---"] * len(titles), *rows]
-        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    def _say(self, text: str) -> None:
+        self._status.content = text
+
+    def _show(self, picture: np.ndarray) -> None:
+        self._image = Image.fromarray(picture)
+        for client in self._server.get_clients().values():
+            self._send(client)
+
+    def _show_pixel(self, rows: Sequence[Sequence[str]]) -> None:
+        titles, *parts = rows
+        lines = [" | ".join(row) for row in (titles, ["---"] * len(titles), *parts)]
+        self._pixel.content = "\n".join(f"| {line} |" for line in lines) if parts else titles[0]
 
     def _send(self, client: Any) -> None:
         """Show the picture in a window of any shape, at the top and beside the controls."""
@@ -219,44 +244,25 @@ class Page:
         canvas = np.asarray(ImageOps.pad(self._image, size, centering=(_LEFT, 0.0)))
         client.scene.set_background_image(canvas, "jpeg", jpeg_quality=_QUALITY)
 
-    def _show(self, image: np.ndarray) -> None:
-        self._image = Image.fromarray(image)
-        for client in self._server.get_clients().values():
-            self._send(client)
-
-    def _note_compiling(self) -> None:
-        self._status.content = COMPILING
-
     def _work(self) -> None:
         while not self._closed.is_set():
             self._changed.wait()
             self._changed.clear()
-            try:
-                with watched_compiling(self._note_compiling):
-                    self._status.content = self._update(self._controls())
-            except Exception as error:
-                self._status.content = sentence_of(error)
+            self._report(self._update)
 
-    def _update(self, controls: Controls) -> str:
-        """Show a state, save what was requested, and return the text of the status line."""
-        session, written = self._session, list[Path]()
-        self._show(session.draft(controls))
-        self._panel.show(controls)
-        if not self._saves and self._changed.wait(STILL):
+    def _update(self) -> str:
+        """Show the current state, save what was requested, and return the status."""
+        controls = self.controls
+        self._show(self._session.draft(controls))
+        self._plot.data = tuple(self._session.curves(controls))
+        self._numbers.content = "  \n".join(coefficient_lines(controls))
+        if not self._saves and self._changed.wait(self.still):
             return ""
-        picture = session.picture(controls)
-        self._show(picture)
-        if self._observations and np.allclose(
-            self._place, [session.start.eye, session.start.target], rtol=_NEAR
-        ):
-            self._compare(picture)
-        while self._saves:
-            kind, saved = self._saves.pop(0)
-            written += save(session, saved, self._folder, kind, self._as_file)
-        self._pixel.content = self._take_apart(controls)
-        if written:
-            return f"saved {', '.join(map(str, written))}"
-        return "" if picture.any() else UNSEEN
+        status = self._finish(controls)
+        if self._observations and np.allclose(self._place, self._first_place, rtol=_NEAR):
+            difference = 128 + (np.asarray(self._image, int) - self._target) // 2
+            self._compared.image = np.hstack([self._target, difference.astype(np.uint8)])
+        return self._save(self._saves) or status
 
 
 def _canvas(width: int, height: int, client: Any) -> tuple[int, int]:

@@ -48,6 +48,7 @@ def save(
 
     **Arguments:**
 
+    - `folder`: created if missing.
     - `as_file`: a function of a folder, material, lights and camera that returns the contents of a
       scene file in this folder, with references to existing files of the body and the lights.
       Without it, these files are written too.
@@ -61,6 +62,7 @@ def save(
     optics, record = session.optics(controls), dict[str, Any]()
     skin = optics if isinstance(optics, Skin) and controls.has_fitted_weights else None
     folder = Path(folder)
+    folder.mkdir(exist_ok=True)
     if as_file is not None:
         record = as_file(folder, scene.material, scene.lights, camera)
         record["material"] = plain_material(scene.material, skin, g=controls.g)

@@ -33,7 +33,6 @@ from ._controls import (
     COEFFICIENTS,
     LAYERS,
     PIGMENTS,
-    SURFACE,
     Controls,
     brightened,
     plain,
@@ -123,8 +122,7 @@ class Session:
         self._still = Body(*full, settings)
         self._full = self._still if self._still.is_blended else Body(*full)
         self._variances = self._planned = material.gaussians.variances
-        self._angles, self._settled, self._fits = material.angles, self.start.coefficients, 0
-        self._last_fit: tuple[Hashable, SumOfGaussians] = (), material.gaussians
+        self._angles, self._settled = material.angles, self.start.coefficients
 
     def picture(self, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
         """Compute the picture that `splatjax.render` makes of `scene(controls)`, for a display.
@@ -144,13 +142,15 @@ class Session:
     def frame(self, controls: Controls, body: Body | None = None) -> Frame:
         """Render the scene with all its layers."""
         body = body or self._still
-
-        def make() -> Frame:
-            scene, camera = self.scene(controls, body), self.camera(controls, body)
-            plan, light = self._plan(body, controls), self._light(body, controls)
-            return render(scene, camera, body.settings, plan, light=light)
-
-        return body.planned(make)
+        return body.planned(
+            lambda: render(
+                self.scene(controls, body),
+                self.camera(controls, body),
+                body.settings,
+                self._plan(body, controls),
+                light=self._light(body, controls),
+            )
+        )
 
     def pixel(
         self, controls: Controls, column: int, row: int
@@ -172,28 +172,25 @@ class Session:
         if optics is not None:
             names = tuple(COEFFICIENTS) if isinstance(optics, Medium) else PIGMENTS[:2]
             inputs = self.model(controls), optics, names, self._variances, self._has_color
-            for name, of in zip(
-                names, changes_with_coefficients(*inputs, basis, place), strict=True
-            ):
-                parts[f"per ln {COEFFICIENTS.get(name, name)}"] = controls.scale * of
+            changes = zip(names, changes_with_coefficients(*inputs, basis, place), strict=True)
+            parts |= {f"per ln {COEFFICIENTS.get(n, n)}": controls.scale * of for n, of in changes}
         return {name: np.asarray(values, np.float64) for name, values in parts.items()}
 
-    def scene(self, controls: Controls, body: Body | None = None, **surface: float) -> Scene:
+    def scene(self, controls: Controls, body: Body | None = None) -> Scene:
         """Return the scene of a state; after `picture`, the scene of that picture. Its material has
         no medium if the weights were changed by hand.
         """
-        surface = {name: getattr(controls, name) for name in SURFACE} | surface
+        optics, body = self.optics(controls), body or self._full
+        has_medium = isinstance(optics, Medium) and controls.has_fitted_weights
         material = dataclasses.replace(
             self.own.material,
             gaussians=self._gaussians(controls),
             angles=self._angles,
-            **surface,
+            medium=optics if has_medium else None,
+            eta=controls.eta,
+            specular=controls.specular,
+            roughness=controls.roughness,
         )
-        optics = self.optics(controls)
-        if isinstance(optics, Medium):
-            medium = optics if controls.has_fitted_weights else None
-            material = dataclasses.replace(material, medium=medium)
-        body = body or self._full
         lights = brightened(turned(body.lights, controls.turn), controls.light_stops)
         return Scene(body.splats, lights, material)
 
@@ -236,10 +233,8 @@ class Session:
         is_own = optics is self.optics(self.start) and self._variances is gaussians.variances
         if optics is None or is_own:
             return gaussians
-        key = controls.coefficients, self._fits
-        if self._last_fit[0] != key:
-            self._last_fit = key, weights_of(self.model(controls), optics, self._variances)
-        return self._last_fit[1]
+        key, inputs = controls.coefficients, (self.model(controls), optics, self._variances)
+        return self._full.keep("fit", (key, self._settled), lambda: weights_of(*inputs))
 
     def _gaussians(self, controls: Controls) -> SumOfGaussians:
         """Return the Gaussians of a state. If splats have an albedo, factors change no color."""
@@ -263,7 +258,7 @@ class Session:
             inputs = self.model(controls), optics, self._variances
             self._variances, angles = variances_and_angles(*inputs)
             self._angles = angles if self._has_color else None
-        self._settled, self._fits = controls.coefficients, self._fits + 1
+        self._settled = controls.coefficients
         if np.max(np.abs(np.log(self._variances / self._planned))) > np.log(_PLANNED):
             self._planned = self._variances
 
@@ -273,7 +268,7 @@ class Session:
         state: Hashable = dataclasses.replace(controls, **of_any_view)
         if body.is_blended:
             state = controls.turn, controls.light_stops, controls.eta, controls.roughness
-        return (state, self._fits), (controls.eye, controls.target)
+        return (state, self._settled), (controls.eye, controls.target)
 
     def _plan(self, body: Body, controls: Controls) -> Plan:
         """Plan for cameras and lights from all sides."""
@@ -304,9 +299,11 @@ class Session:
 
     def _basis(self, body: Body, controls: Controls) -> DiffusionBasis:
         def make() -> DiffusionBasis:
-            scene, camera = self.scene(controls, body, specular=1.0), self.camera(controls, body)
+            shiny = dataclasses.replace(controls, specular=1.0)
             plan, light = self._plan(body, controls), self._light(body, controls)
-            basis = diffusion_basis(scene, camera, plan=plan, light=light)
+            basis = diffusion_basis(
+                self.scene(shiny, body), self.camera(shiny, body), plan=plan, light=light
+            )
             # Less than half of the points are seen, which is what a slider then waits for.
             is_seen = np.any(np.asarray(basis.pixel_radiance_per_exitance) != 0, axis=0)
             count = rounded_up(int(is_seen.sum()), 1, per_octave=2)

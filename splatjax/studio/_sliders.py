@@ -1,4 +1,4 @@
-"""Sliders, their meaning, and messages, which pages and widgets share."""
+"""Sliders and tables, which pages and widgets share."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,9 +13,6 @@ from splatjax.scattering import Medium
 from ._controls import COEFFICIENTS, Controls
 from ._session import Session
 
-STILL = 0.15  # s without a change, after which the whole picture is computed
-COMPILING = "compiling, once for this and later starts ..."
-UNSEEN = "nothing is visible; the camera may be inside the body"
 _MOST, _STOPS = 4.0, 8.0  # powers of 2, of coefficients and of light
 _LARGEST_G = 0.95
 _GENERAL = {
@@ -109,12 +106,6 @@ def coefficient_lines(controls: Controls) -> list[str]:
     """Format the coefficients of a state."""
     rows = [(label, getattr(controls, field)) for field, label in COEFFICIENTS.items()]
     return [f"{label}: {format_numbers(row, '.4g')} /mm" for label, row in rows if row]
-
-
-def sentence_of(error: Exception) -> str:
-    """Return a sentence about an error, for a page."""
-    is_clear = isinstance(error, (OSError, ValueError))
-    return str(error) if is_clear else f"{type(error).__name__}: {error}"
 
 
 def pixel_rows(session: Session, controls: Controls, pixel: tuple[int, int]) -> list[list[str]]:

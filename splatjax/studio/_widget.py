@@ -6,7 +6,8 @@ import asyncio
 import contextlib
 import io
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +17,12 @@ from jupyter_rfb import RemoteFrameBuffer
 from matplotlib.figure import Figure
 
 from splatjax._format import CHANNEL_COLORS
-from splatjax.cache import watched_compiling
 
 from ._controls import LAYERS, Controls, orbited, shifted, zoomed
-from ._saving import SUFFIXES, save
+from ._saving import SUFFIXES
 from ._session import Session
-from ._sliders import (
-    COMPILING,
-    STILL,
-    UNSEEN,
-    coefficient_lines,
-    controls_of,
-    pixel_rows,
-    sentence_of,
-    sliders,
-)
+from ._sliders import coefficient_lines, sliders
+from ._viewer import Viewer
 
 _LEFT, _RIGHT = (1,), (2,)  # buttons of a mouse
 _CLICK = 3  # pixels by which a mouse may move in a click
@@ -52,48 +44,41 @@ class _Canvas(RemoteFrameBuffer):
         self._widget._follow(event)
 
 
-class Widget(ipywidgets.HBox):
+class Widget(Viewer, ipywidgets.HBox):
     """A session in a cell of a notebook, with the controls of a `Page`. See `widget`."""
 
     def __init__(self, session: Session, folder: str | Path):
-        self._session, self._folder = session, Path(folder)
-        self._place = self._first_place = np.asarray([session.start.eye, session.start.target])
+        Viewer.__init__(self, session, folder)
         camera = session.camera(session.start)
         self._size = camera.width, camera.height
         self._canvas = _Canvas(self, *self._size)
         self._pressed: tuple[float, float] | None = None
-        self._last, self._picked = (0.0, 0.0), None
+        self._last = 0.0, 0.0
         self._timer: asyncio.TimerHandle | None = None
-        self._layer = ipywidgets.Dropdown(options=LAYERS, description="layer")
-        self._sliders = dict[str, ipywidgets.FloatSlider]()
         self._status = ipywidgets.Label()
         self._numbers, self._pixel, self._plot = (ipywidgets.HTML() for _ in range(3))
-        buttons = [ipywidgets.Button(description=name) for name in ("first view", *SUFFIXES)]
-        buttons[0].on_click(lambda _: self._look(self._first_place))
-        for button, kind in zip(buttons[1:], SUFFIXES, strict=True):
-            button.on_click(lambda _, kind=kind: self._save(kind))
-            button.tooltip = f"save the {kind}"
-        for button in buttons:
-            button.layout.width = "auto"
-        below = ipywidgets.HBox([buttons[0], ipywidgets.Label("save"), *buttons[1:]])
+        below = ipywidgets.HBox(self._make_buttons())
         left = [self._canvas, below, self._status, self._pixel]
-        right = [self._layer, *self._add_sliders(), self._numbers, self._plot]
-        for control in (self._layer, *self._sliders.values()):
-            control.observe(lambda _: self._canvas.request_draw(), "value")
+        right = [*self._make_sliders(), self._numbers, self._plot]
+        for handle in self._handles.values():
+            handle.observe(lambda _: self._canvas.request_draw(), "value")
         boxes = [ipywidgets.VBox(left), ipywidgets.VBox(right)]
-        super().__init__(boxes, layout={"flex_flow": "row wrap"})
+        ipywidgets.HBox.__init__(self, boxes, layout={"flex_flow": "row wrap"})
 
-    @property
-    def controls(self) -> Controls:
-        """The state of the sliders and of the camera."""
-        values = {name: slider.value for name, slider in self._sliders.items()}
-        values |= {"layer": self._layer.value}
-        return controls_of(self._session.start, values, self._place)
+    def _make_buttons(self) -> list[ipywidgets.Widget]:
+        def button(name: str, tooltip: str | None, action: Callable[[], None]) -> ipywidgets.Button:
+            made = ipywidgets.Button(description=name, tooltip=tooltip, layout={"width": "auto"})
+            made.on_click(lambda _: action())
+            return made
 
-    def _add_sliders(self) -> list[ipywidgets.Widget]:
-        shown = list[ipywidgets.Widget]()
-        for folder, group in itertools.groupby(sliders(self._session), lambda each: each.folder):
-            of_folder = list(group)
+        first = button("first view", None, lambda: self._look(self._first_place))
+        saves = [button(kind, f"save the {kind}", partial(self._write, kind)) for kind in SUFFIXES]
+        return [first, ipywidgets.Label("save"), *saves]
+
+    def _make_sliders(self) -> list[ipywidgets.Widget]:
+        layer = ipywidgets.Dropdown(options=LAYERS, description="layer")
+        self._handles["layer"], shown = layer, [layer]
+        for folder, of_folder in itertools.groupby(sliders(self._session), lambda one: one.folder):
             made = {
                 each.name: ipywidgets.FloatSlider(
                     each.value,
@@ -107,7 +92,7 @@ class Widget(ipywidgets.HBox):
                 )
                 for each in of_folder
             }
-            self._sliders |= made
+            self._handles |= made
             box = ipywidgets.VBox(list(made.values()))
             is_open = 0 if folder == "skin" else None
             shown.append(
@@ -121,32 +106,16 @@ class Widget(ipywidgets.HBox):
         """Compute a draft, and schedule the full picture for when nothing moves."""
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = asyncio.get_running_loop().call_later(STILL, self._settle)
-        with watched_compiling(self._note_compiling):
+        self._timer = asyncio.get_running_loop().call_later(self.still, self._report, self._settle)
+        with self._watched():
             return self._session.draft(self.controls)
 
-    def _settle(self) -> None:
-        self._report(self._show_all)
-
-    def _report(self, action: Callable[[], str]) -> None:
-        """Run a slow action, and show the text that it returns or its error."""
-        try:
-            with watched_compiling(self._note_compiling):
-                self._status.value = action()
-        except Exception as error:
-            self._status.value = sentence_of(error)
-
-    def _show_all(self) -> str:
+    def _settle(self) -> str:
         controls = self.controls
-        picture = self._session.picture(controls)
-        self._canvas.send_frame(picture)
+        status = self._finish(controls)
         self._numbers.value = "<br>".join(coefficient_lines(controls))
         self._plot.value = self._drawn(controls)
-        if self._picked is not None:
-            rows = pixel_rows(self._session, controls, self._picked)
-            cells = ["".join(f"<td>{cell}&emsp;</td>" for cell in row) for row in rows]
-            self._pixel.value = f"<table><tr>{'</tr><tr>'.join(cells)}</tr></table>"
-        return "" if picture.any() else UNSEEN
+        return status
 
     def _drawn(self, controls: Controls) -> str:
         """Plot the profile and its fit as SVG."""
@@ -162,17 +131,19 @@ class Widget(ipywidgets.HBox):
         figure.savefig(text, format="svg")
         return text.getvalue()
 
-    def _note_compiling(self) -> None:
-        self._status.value = COMPILING
+    def _say(self, text: str) -> None:
+        self._status.value = text
 
-    def _save(self, kind: str) -> None:
-        def write() -> str:
-            self._folder.mkdir(exist_ok=True)
-            paths = save(self._session, self.controls, self._folder, kind)
-            return f"saved {', '.join(map(str, paths))}"
+    def _show(self, picture: np.ndarray) -> None:
+        self._canvas.send_frame(picture)
 
-        self._status.value = "saving ..."
-        self._report(write)
+    def _show_pixel(self, rows: Sequence[Sequence[str]]) -> None:
+        cells = ["".join(f"<td>{cell}&emsp;</td>" for cell in row) for row in rows]
+        self._pixel.value = f"<table><tr>{'</tr><tr>'.join(cells)}</tr></table>"
+
+    def _write(self, kind: str) -> None:
+        self._say("saving ...")
+        self._report(lambda: self._save([(kind, self.controls)]))
 
     def _look(self, place: np.ndarray) -> None:
         self._place = place
@@ -185,8 +156,8 @@ class Widget(ipywidgets.HBox):
             self._look(zoomed(self._place, event["dy"] / 500))
         if not kind.startswith("pointer"):
             return
-        at, (x, y) = (event["x"], event["y"]), self._last
-        across, down = (at[0] - x) / self._size[1], (at[1] - y) / self._size[1]
+        at = event["x"], event["y"]
+        across, down = np.subtract(at, self._last) / self._size[1]
         self._last = at
         if kind == "pointer_down":
             self._pressed = at

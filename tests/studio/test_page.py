@@ -51,7 +51,7 @@ def test_only_this_computer_reaches_the_page_and_it_writes_to_one_folder(page, t
     assert page.url in page._repr_html_()  # as a notebook shows it
     assert page._server.get_host() == "127.0.0.1"
     assert page._server.request_share_url() is None
-    page._panel.handles["sigma_a 0"].value = 1.0
+    page._handles["sigma_a 0"].value = 1.0
     page._change("PNG", "material")
     names = ["studio_000.png", "studio_001.toml"]
     wait_until(lambda: len([*tmp_path.rglob("studio_*.*")]) == len(names))
@@ -79,12 +79,12 @@ def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp
     observation = sj.inverse.Observation(target, camera, lights)
     searching = Page(session, tmp_path, observations=[observation], port=18_090)
     press = searching._search.start
-    press(searching._controls())
+    press(searching.controls)
     searching._search.stop()
     wait_until(lambda: "stopped" in searching._stage.content)
-    press(searching._controls())
+    press(searching.controls)
     wait_until(lambda: "error bars" in searching._stage.content)
-    powers = [searching._panel.handles[f"sigma_a {channel}"].value for channel in (1, 2, 3)]
+    powers = [searching._handles[f"sigma_a {channel}"].value for channel in (1, 2, 3)]
     np.testing.assert_allclose(powers, np.log2(1.5), atol=0.06)
     wait_until(lambda: searching._status.content == "")
     difference = searching._compared.image[:, SIDE:].astype(int) - 128
@@ -123,15 +123,13 @@ def test_a_browser_picks_drags_orbits_and_saves(page, tmp_path):
         for folder in (*of_medium, "weights, by factors"):
             window.get_by_text(folder).click()
         sliders = window.get_by_role("slider")
-        moving = {
-            name: handle.value for name, handle in page._panel.handles.items() if name != "layer"
-        }
+        moving = {name: handle.value for name, handle in page._handles.items() if name != "layer"}
         wait_until(lambda: sliders.count() == len(moving))
         for number in range(len(moving)):
             sliders.nth(number).focus()
             window.keyboard.press("ArrowLeft")
             window.wait_for_timeout(100)
-        wait_until(lambda: all(page._panel.handles[name].value < moving[name] for name in moving))
+        wait_until(lambda: all(page._handles[name].value < moving[name] for name in moving))
         window.reload()
         window.wait_for_selector("text=turn lights")
         shows_the_picture()
@@ -182,8 +180,8 @@ def test_a_scene_file_opens_and_what_is_saved_is_one(tmp_path):
     (tmp_path / "maps").mkdir()
     write_picture(tmp_path / "maps" / "sky.exr", np.asarray(sj.scene.overcast_sky()))
     page = Studio(splats=scene, output=looks, port=18_070).page()
-    page._panel.handles["light 1"].value = -2.0
-    page._panel.handles["turn"].value = 30.0
+    page._handles["light 1"].value = -2.0
+    page._handles["turn"].value = 30.0
     page._change("scene", "EXR")
     wait_until(lambda: "studio_001.exr" in page._status.content)
     page.close()
