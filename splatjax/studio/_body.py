@@ -6,11 +6,10 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 
-from splatjax.render import DiffusionBasis, RenderSettings
-from splatjax.scene import AbstractLight, EnvironmentLight, Frame, Splats
+from splatjax.render import RenderSettings
+from splatjax.scene import AbstractLight, EnvironmentLight, Splats
 
 Kept = TypeVar("Kept")
-Rendered = TypeVar("Rendered", DiffusionBasis, Frame)
 
 
 class Body:
@@ -46,7 +45,7 @@ class Body:
             self.kept[kind] = depends_on, jax.block_until_ready(make())
         return self.kept[kind][1]
 
-    def planned(self, make: Callable[[], Rendered]) -> Rendered:
+    def planned(self, make: Callable[[], Any]) -> Any:
         """Render, with a new plan if the kept one does not suffice."""
         rendered = make()
         if rendered.overflow > 0:

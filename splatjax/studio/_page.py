@@ -3,7 +3,6 @@ compiles, so that the page stays responsive.
 """
 
 import io
-import itertools
 import threading
 from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout
@@ -121,10 +120,10 @@ class Page(Viewer):
 
     def _add_sliders(self, gui: Any) -> None:
         self._handles["layer"] = gui.add_dropdown("layer", LAYERS)
-        for folder, of_folder in itertools.groupby(sliders(self._session), lambda one: one.folder):
+        for folder, of_folder in sliders(self._session).items():
             is_open = folder == "skin"
             with gui.add_folder(folder, expand_by_default=is_open) if folder else nullcontext():
-                for name, label, low, high, value, _, step in of_folder:
+                for name, label, low, high, value, step in of_folder:
                     self._handles[name] = gui.add_slider(label, low, high, step, value)
 
         def moved(event: Any) -> None:
@@ -138,22 +137,19 @@ class Page(Viewer):
 
     def _add_plot(self, gui: Any) -> None:
         """Add the drawing of the profile and its fit."""
-        curves, channels = (
-            self._session.curves(self._session.start),
-            self._session.own.material.channels,
-        )
+        radii, *_ = curves = self._session.curves(self._session.start)
+        channels = self._session.own.material.channels
         profiles, hidden = len(curves) - 1 - channels, {"points": {"show": False}}
         series = [
             {"stroke": CHANNEL_COLORS[i % channels % 3] + opacity, "width": width, **hidden}
             for i in range(profiles + channels)
             for opacity, width in [("60", 6) if i < profiles else ("", 1.5)]
         ]
-        ends = float(curves[0][0]), float(curves[0][-1])
         self._plot = gui.add_uplot(
             tuple(curves),
             ({"label": "r"}, *series),
             title="r R(r) over r in mm, and its fit (narrow)",
-            scales={"x": {"time": False, "distr": 3, "range": ends}},
+            scales={"x": {"time": False, "distr": 3, "range": (float(radii[0]), float(radii[-1]))}},
             legend={"show": False},
             aspect=1.8,
         )
@@ -164,8 +160,9 @@ class Page(Viewer):
             buttons = gui.add_button_group("search", ("start", "stop"))
             self._stage = gui.add_markdown("")
             self._target = to_display(np.asarray(self._observations[0].picture))
-            label = "first picture; the page's less it (gray: the same)"
-            self._compared = gui.add_image(self._target, label=label)
+            self._compared = gui.add_image(
+                self._target, label="first picture; the page's less it (gray: the same)"
+            )
 
         def press(event: Any) -> None:
             if event.target.value == "start":
@@ -194,26 +191,23 @@ class Page(Viewer):
         self._changed.set()
 
     def _join(self, client: Any) -> None:
-        def look(camera: Any) -> None:
-            with self._looking:  # viser calls this from several threads
-                self._look(camera)
-
-        client.camera.on_update(look)
+        client.camera.on_update(self._look)
 
     def _look(self, camera: Any) -> None:
         place = np.asarray([camera.position, camera.look_at])
         near = _NEAR * np.linalg.norm(place[0] - place[1])
-        if camera.client not in self._joined:
-            # At first viser sends cameras of its own, and then the one that the page starts with.
-            if np.max(np.abs(place - self._first_place)) < near:
-                self._joined.append(camera.client)
-                camera.position, camera.look_at = self._place
-            self._send(camera.client)
-        elif np.max(np.abs(place - self._place)) > near:
-            self._place = place
-            self._change()
-        else:  # its window may have another shape
-            self._send(camera.client)
+        with self._looking:  # viser calls this from several threads
+            if camera.client not in self._joined:
+                # At first viser sends cameras of its own, then the one that the page starts with.
+                if np.max(np.abs(place - self._first_place)) < near:
+                    self._joined.append(camera.client)
+                    camera.position, camera.look_at = self._place
+                self._send(camera.client)
+            elif np.max(np.abs(place - self._place)) > near:
+                self._place = place
+                self._change()
+            else:  # its window may have another shape
+                self._send(camera.client)
 
     def _pick(self, event: Any) -> None:
         """Choose the pixel that was clicked, or none outside of the picture."""

@@ -32,8 +32,7 @@ def light_of_gaussians(
     """Compute the contribution of each Gaussian to the radiance of a pixel (row, column)."""
     layers, _ = basis.light.weigh(gaussians, jnp.zeros_like(gaussians.weights[0]))
     radiance = gaussians.weights[:, :, None] * layers * basis.pixel_radiance_per_exitance[None]
-    row, column = place
-    at_pixel = basis.pixels == row * basis.specular.shape[1] + column
+    at_pixel = basis.pixels == place[0] * basis.specular.shape[1] + place[1]
     return jnp.sum(jnp.where(at_pixel, radiance, 0.0), axis=2)
 
 

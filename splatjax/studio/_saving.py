@@ -59,13 +59,13 @@ def save(
     """
     session.picture(controls)  # whose variances and angles are those of the coefficients
     scene, camera = session.scene(controls), session.camera(controls)
-    optics, record = session.optics(controls), dict[str, Any]()
+    optics, folder = session.optics(controls), Path(folder)
     skin = optics if isinstance(optics, Skin) and controls.has_fitted_weights else None
-    folder = Path(folder)
-    folder.mkdir(exist_ok=True)
+    record = None
     if as_file is not None:
         record = as_file(folder, scene.material, scene.lights, camera)
         record["material"] = plain_material(scene.material, skin, g=controls.g)
+    folder.mkdir(exist_ok=True)
     taken = {path.stem for path in folder.iterdir()}
     name = next(name for n in range(len(taken) + 1) if (name := f"studio_{n:03}") not in taken)
     paths = [folder / f"{name}{suffix}" for suffix in SUFFIXES[kind]]
@@ -81,8 +81,13 @@ def save(
             camera=camera,
         )
     elif kind == "material":
-        source = {"provenance": "the studio of splatjax"}
-        save_material(scene.material, paths[0], profile=skin, source=source, g=controls.g)
+        save_material(
+            scene.material,
+            paths[0],
+            profile=skin,
+            source={"provenance": "the studio of splatjax"},
+            g=controls.g,
+        )
     else:
         if record:
             write_toml(paths[0], record)

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +14,6 @@ from splatjax.scene import Material, Splats
 
 from ._controls import Controls
 from ._session import Session
-
-
-class _Stopped(Exception):
-    """Raised to end the search."""
 
 
 class Search:
@@ -50,8 +47,7 @@ class Search:
         """Search from the coefficients of a state, unless a search is already running."""
         if not self._thread.is_alive():
             self._stopped.clear()
-            material = self._session.scene(controls).material
-            inputs = material, TransportModel(controls.g)
+            inputs = self._session.scene(controls).material, TransportModel(controls.g)
             self._thread = threading.Thread(target=self._run, args=inputs, daemon=True)
             self._thread.start()
 
@@ -67,7 +63,7 @@ class Search:
     def _run(self, material: Material, model: TransportModel) -> None:
         def progress(stage: str, medium: Medium) -> None:
             if self._stopped.is_set():
-                raise _Stopped
+                raise CancelledError
             self._report(stage, medium)
 
         body = self._session.own.splats
@@ -85,7 +81,7 @@ class Search:
                     progress=progress,
                 )
                 self._report(recovery.summary(), recovery.medium)
-        except _Stopped:
+        except CancelledError:
             self._report("stopped", None)
         except Exception as error:
             self._report(f"{type(error).__name__}: {error}", None)

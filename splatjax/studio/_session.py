@@ -205,10 +205,11 @@ class Session:
         **Returns:** radii (mm); for each channel, if there are coefficients, the profile times the
         radius (1/mm); and for each channel the sum of Gaussians times the radius.
         """
-        optics, gaussians = self.optics(controls), self._fitted(controls)
         widest = 3 * np.sqrt(np.max(self.own.material.gaussians.variances))
         radii = jnp.asarray(np.geomspace(0.01 * widest, widest, 120), self._variances.dtype)
-        rows = profile_curves(self.model(controls), optics, gaussians, radii)
+        rows = profile_curves(
+            self.model(controls), self.optics(controls), self._fitted(controls), radii
+        )
         return [np.asarray(row, np.float64) for row in (radii, *rows)]
 
     def model(self, controls: Controls) -> _fitting.AbstractModel:
@@ -255,8 +256,9 @@ class Session:
         material, optics = self.own.material, self.optics(controls)
         self._variances, self._angles = material.gaussians.variances, material.angles
         if optics is not None and optics is not self.optics(self.start):
-            inputs = self.model(controls), optics, self._variances
-            self._variances, angles = variances_and_angles(*inputs)
+            self._variances, angles = variances_and_angles(
+                self.model(controls), optics, self._variances
+            )
             self._angles = angles if self._has_color else None
         self._settled = controls.coefficients
         if np.max(np.abs(np.log(self._variances / self._planned))) > np.log(_PLANNED):
@@ -264,8 +266,9 @@ class Session:
 
     def _keys(self, controls: Controls, body: Body) -> tuple[Hashable, Hashable]:
         """Return keys of the light on the splats, and of the view."""
-        of_any_view = {"eye": (), "target": (), "layer": LAYERS[0], "exposure": 0.0}
-        state: Hashable = dataclasses.replace(controls, **of_any_view)
+        state: Hashable = dataclasses.replace(
+            controls, eye=(), target=(), layer=LAYERS[0], exposure=0.0
+        )
         if body.is_blended:
             state = controls.turn, controls.light_stops, controls.eta, controls.roughness
         return (state, self._settled), (controls.eye, controls.target)
@@ -280,29 +283,32 @@ class Session:
             eyes = [plain(np.add(start.target, offset)) for offset in offsets]
             states = [controls, *(dataclasses.replace(start, eye=eye) for eye in eyes)]
             turns = [0.0] if body.is_in_environments else _QUARTERS
-            scenes = [dataclasses.replace(scene, lights=turned(scene.lights, t)) for t in turns]
-            cameras = [self.camera(state, body) for state in states]
-            return make_plan(scenes, cameras, body.settings)
+            return make_plan(
+                [dataclasses.replace(scene, lights=turned(scene.lights, turn)) for turn in turns],
+                [self.camera(state, body) for state in states],
+                body.settings,
+            )
 
         return body.keep("plan", plain(self._planned), make)
 
     def _light(self, body: Body, controls: Controls) -> SplatLight:
-        plan, turn = self._plan(body, controls), None if body.keeps_shadows else controls.turn
+        turn = None if body.keeps_shadows else controls.turn
 
         def make() -> SplatLight:
-            scene = self.scene(controls, body)
-            given = scene, plan, body.settings
-            visible = body.keep("visibility", (turn,), lambda: transfer(*given))
-            return illuminate(*given, light=visible)
+            inputs = self.scene(controls, body), self._plan(body, controls), body.settings
+            visible = body.keep("visibility", (turn,), lambda: transfer(*inputs))
+            return illuminate(*inputs, light=visible)
 
         return body.keep("light", self._keys(controls, body)[0], make)
 
     def _basis(self, body: Body, controls: Controls) -> DiffusionBasis:
         def make() -> DiffusionBasis:
             shiny = dataclasses.replace(controls, specular=1.0)
-            plan, light = self._plan(body, controls), self._light(body, controls)
             basis = diffusion_basis(
-                self.scene(shiny, body), self.camera(shiny, body), plan=plan, light=light
+                self.scene(shiny, body),
+                self.camera(shiny, body),
+                plan=self._plan(body, controls),
+                light=self._light(body, controls),
             )
             # Less than half of the points are seen, which is what a slider then waits for.
             is_seen = np.any(np.asarray(basis.pixel_radiance_per_exitance) != 0, axis=0)

@@ -1,6 +1,7 @@
 """Sliders and tables, which pages and widgets share."""
 
 import dataclasses
+from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ from splatjax._format import channel_names, format_numbers
 from splatjax.diffusion import ShapeDiffuser
 from splatjax.scattering import Medium
 
-from ._controls import COEFFICIENTS, Controls
+from ._controls import COEFFICIENTS, Controls, plain
 from ._session import Session
 
 _MOST, _STOPS = 4.0, 8.0  # powers of 2, of coefficients and of light
@@ -43,42 +44,41 @@ class Slider(NamedTuple):
     low: float
     high: float
     value: float
-    folder: str = ""
     step: float = 0.01
 
 
-def sliders(session: Session) -> list[Slider]:
-    """List the sliders of a session, grouped by folder."""
-    start, found = session.start, list[Slider]()
+def sliders(session: Session) -> dict[str, list[Slider]]:
+    """List the sliders of a session by folder. The first ones are in no folder, under ""."""
+    start, folders = session.start, defaultdict[str, list[Slider]](list)
 
-    def add(name: str, label: str, low: float, high: float, value: float, *folder: Any) -> None:
-        found.append(Slider(name, label, min(low, value), max(high, value), value, *folder))
+    def add(folder: str, name: str, label: str, low: float, high: float, value: float, *step):
+        slider = Slider(name, label, min(low, value), max(high, value), value, *step)
+        folders[folder].append(slider)
 
     # The diffusion equation uses no weights.
     has_weights = not isinstance(session.settings.diffuser, ShapeDiffuser)
     for name, slider in _GENERAL.items():
         if name != "scale" or has_weights:
-            add(name, *slider, getattr(start, name))
+            add("", name, *slider, getattr(start, name))
     if start.sigma_a:
-        add("g", "g, mean cosine", -_LARGEST_G, _LARGEST_G, start.g)
+        add("", "g", "g, mean cosine", -_LARGEST_G, _LARGEST_G, start.g)
     for number, light in enumerate(session.own.lights if len(start.light_stops) > 1 else ()):
         label = f"{type(light).__name__.removesuffix('Light').lower()} {number + 1}, stops"
-        add(f"light {number}", label, -_STOPS, _STOPS, 0.0)
+        add("", f"light {number}", label, -_STOPS, _STOPS, 0.0)
     for name, value in start.skin:
-        add(f"skin {name}", *_PIGMENTS[name], value, "skin", 0.001)
+        add("skin", f"skin {name}", *_PIGMENTS[name], value, 0.001)
     names = ("all", *channel_names(session.own.material.channels)) if start.sigma_a else ()
     for field, label in COEFFICIENTS.items():
         for number, name in enumerate(names):
-            add(f"{field} {number}", name, -_MOST, _MOST, 0.0, f"{label}, by powers of 2")
+            add(f"{label}, by powers of 2", f"{field} {number}", name, -_MOST, _MOST, 0.0)
     widths = np.sqrt(session.own.material.gaussians.variances).tolist() if has_weights else ()
     for number, width in enumerate(widths):
-        add(f"factor {number}", f"{width:.2g} mm", 0.0, 2.0, 1.0, "weights, by factors")
-    return found
+        add("weights, by factors", f"factor {number}", f"{width:.2g} mm", 0.0, 2.0, 1.0)
+    return folders
 
 
 def controls_of(start: Controls, values: Mapping[str, Any], place: np.ndarray) -> Controls:
     """Return the state given by the values of sliders, and by a camera's position and target."""
-    eye, target = place.tolist()
     changed = {name: value for name, value in values.items() if " " not in name}
     for field in COEFFICIENTS:
         changed[field] = tuple(
@@ -89,7 +89,7 @@ def controls_of(start: Controls, values: Mapping[str, Any], place: np.ndarray) -
     for field, prefix in (("light_stops", "light "), ("factors", "factor ")):
         of_field = tuple(value for name, value in values.items() if name.startswith(prefix))
         changed[field] = of_field or getattr(start, field)
-    return dataclasses.replace(start, eye=tuple(eye), target=tuple(target), **changed)
+    return dataclasses.replace(start, eye=plain(place[0]), target=plain(place[1]), **changed)
 
 
 def values_of_medium(start: Controls, medium: Medium) -> dict[str, float]:

@@ -5,7 +5,6 @@ notebook's own connection, so that the kernel may run on another computer.
 import asyncio
 import contextlib
 import io
-import itertools
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -32,9 +31,13 @@ class _Canvas(RemoteFrameBuffer):
     """A picture that is drawn when the browser is ready for it."""
 
     def __init__(self, widget: "Widget", width: int, height: int):
-        size = {"css_width": f"{width}px", "css_height": f"{height}px"}
         with contextlib.redirect_stdout(io.StringIO()):  # outside of a notebook it prints
-            super().__init__(resizable=False, cursor="grab", **size)
+            super().__init__(
+                resizable=False,
+                cursor="grab",
+                css_width=f"{width}px",
+                css_height=f"{height}px",
+            )
         self._widget = widget
 
     def get_frame(self) -> np.ndarray:
@@ -77,8 +80,8 @@ class Widget(Viewer, ipywidgets.HBox):
 
     def _make_sliders(self) -> list[ipywidgets.Widget]:
         layer = ipywidgets.Dropdown(options=LAYERS, description="layer")
-        self._handles["layer"], shown = layer, [layer]
-        for folder, of_folder in itertools.groupby(sliders(self._session), lambda one: one.folder):
+        self._handles["layer"], shown = layer, list[ipywidgets.Widget]([layer])
+        for folder, of_folder in sliders(self._session).items():
             made = {
                 each.name: ipywidgets.FloatSlider(
                     each.value,
