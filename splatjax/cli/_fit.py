@@ -3,7 +3,7 @@ batches. Finished batches are kept, and are joined to one table at the end.
 """
 
 import shutil
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,19 +13,17 @@ import tyro
 
 import splatjax as sj
 from splatjax._format import counted, format_numbers
-from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
 from . import _models
-from ._models import Coefficients, Model, Reference, model_by_name, print_fit, reference
 from ._terminal import (
     FIGURES,
     OptionalFloat,
     OptionalPath,
     check_options,
     check_output,
+    check_unused,
     complete,
     note,
-    option_name,
     save_figure,
     stage,
 )
@@ -34,6 +32,7 @@ _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a 
 # Error that is noted, and ratio of the channels' widths that explains it.
 _LARGE, _APART = 0.05, 3.0
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
+_OF_ALL = {"medium", "count", "model", "g", "output", "all"}
 # Options that affect only one kind of input.
 _OPTIONS = {
     _COEFFICIENTS: ("model", "photons", "g", "single_scattering"),
@@ -74,7 +73,9 @@ class Fit:
     error: OptionalFloat = None
     #: Model of the profile of coefficients: photon-beam (default), dipole, better-dipole or
     #: monte-carlo. Layers use the multipole, or monte-carlo.
-    model: Annotated[Model | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="")] = None
+    model: Annotated[
+        _models.Model | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="")
+    ] = None
     #: Mean cosine of Henyey and Greenstein's phase function, for photon beams and Monte Carlo. By
     #: default the value in the file, or 0.
     g: OptionalFloat = None
@@ -111,6 +112,10 @@ class Fit:
         check_options(
             self,
             {
+                "model": (
+                    not self.all or self.model != "monte-carlo",
+                    "be photon-beam, dipole or better-dipole with --all",
+                ),
                 "count": (1 <= self.count <= most, f"lie between 1 and {most}"),
                 "error": (self.error is None or self.error > 0, "be positive, such as 0.01"),
                 "g": (self.g is None or abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
@@ -125,21 +130,16 @@ class Fit:
         """
         if self.output is None:
             raise ValueError("--all needs --output, a CSV file for the fits")
-        kept = {name: getattr(self, name) for name in ("medium", "count", "model", "g", "output")}
-        if self != Fit(all=True, **kept) or self.model == "monte-carlo":
-            raise ValueError(
-                "--all takes --count, --g, and --model photon-beam, dipole or better-dipole; leave "
-                "the other options out"
-            )
-        model = model_by_name(self.model, self.g or 0.0)
-        names, coefficients = read_media(Path(self.medium))
+        check_unused(self, vars(self).keys() - _OF_ALL, "--all takes only --count, --model and --g")
+        model = _models.model_by_name(self.model, self.g or 0.0)
+        names, coefficients = sj.io.read_media(Path(self.medium))
         path = self.output.with_name(f"{self.output.name}.parts")
         begins = range(0, len(names), _models.BATCH)
         parts = [path / f"from_{begin:08}.csv" for begin in begins]
 
         def fit(i: int) -> None:
             batch = slice(begins[i], begins[i] + _models.BATCH)
-            write_columns(
+            sj.io.write_columns(
                 parts[i],
                 {"name": names[batch]} | _models.fit_batch(coefficients[batch], self.count, model),
             )
@@ -147,7 +147,7 @@ class Fit:
         done = complete(
             path / "fits.json",
             {
-                "media": fingerprint(self.medium),
+                "media": sj.io.fingerprint(self.medium),
                 "--count": self.count,
                 "--model": self.model,
                 "--g": self.g,
@@ -162,13 +162,13 @@ class Fit:
         if len(done) < len(parts):
             return
         try:
-            tables = [read_columns(part) for part in parts]
+            tables = [sj.io.read_columns(part) for part in parts]
         except FileNotFoundError:  # another process has joined them at the same time
             if not self.output.exists():
                 raise
             return
         columns = {name: [cell for table in tables for cell in table[name]] for name in tables[0]}
-        write_columns(self.output, columns)
+        sj.io.write_columns(self.output, columns)
         shutil.rmtree(path, ignore_errors=True)
         failed = columns["converged"].count("0.0")
         note(
@@ -181,7 +181,7 @@ class Fit:
     def _run(self) -> None:
         coefficients, target = self._target()
         fitted = self._fitted(target)
-        print_fit(fitted, target)
+        _models.print_fit(fitted, target)
         if isinstance(coefficients, sj.Dipole):
             paths = format_numbers(1 / coefficients.medium.sigma_t_prime, ".3g")
             note(f"{self.medium}: mean free path {paths} mm")
@@ -203,7 +203,7 @@ class Fit:
                 plot_fit(target.profile, fitted.gaussians, rule=target.rule, title=title), self.plot
             )
 
-    def _note_error(self, target: Reference, fitted: sj.fitting.FitResult) -> None:
+    def _note_error(self, target: _models.Reference, fitted: sj.fitting.FitResult) -> None:
         """Note a large error, and its cause if the widths of channels differ too much."""
         scales, count = target.profile.length_scale(), len(fitted.gaussians.variances)
         error, ratio = float(fitted.error.max()), float(scales.max() / scales.min())
@@ -219,28 +219,21 @@ class Fit:
                 f"{_LARGE}"
             )
 
-    def _target(self) -> tuple[Coefficients | None, Reference]:
+    def _target(self) -> tuple[_models.Coefficients | None, _models.Reference]:
         """Read the input; return its coefficients, `None` if it is measured, and the profile to
         fit. Raise `ValueError` for options without effect on this kind of input.
         """
         kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
-        changed = {
-            field.name for field in fields(self) if getattr(self, field.name) != field.default
-        }
         for intended, names in _OPTIONS.items():
-            without_effect = [name for name in names if intended != kind and name in changed]
-            if without_effect:
-                raise ValueError(
-                    f"{option_name(without_effect[0])} is for {intended}, and {self.medium} is "
-                    f"read as {kind}; leave it out"
-                )
+            if intended != kind:
+                check_unused(self, names, f"{self.medium} is read as {kind}, not as {intended}")
         if kind == _COEFFICIENTS:
             coefficients = sj.load_profile(self.medium)
             # A dipole depends only on the reduced coefficients.
             needs_g = self.g is not None or self.model not in ("dipole", "better-dipole")
             g = self._mean_cosine() if needs_g else 0.0
             with sj.io.naming(self.medium):
-                return coefficients, reference(
+                return coefficients, _models.reference(
                     coefficients, self.model, self.photons, g, self.single_scattering
                 )
         if kind == _PROFILE:
@@ -260,10 +253,13 @@ class Fit:
                 f"{self.medium} has {len(measured.radii)} radii, too few to determine "
                 f"{counted(self.count, 'Gaussian')}; give a smaller --count"
             )
-        weights = sj.fitting.NonNegativeWeights(sj.fitting.FreeWeights())
-        return None, Reference(measured, description="measured", weights=weights)
+        return None, _models.Reference(
+            measured,
+            description="measured",
+            weights=sj.fitting.NonNegativeWeights(sj.fitting.FreeWeights()),
+        )
 
-    def _fitted(self, target: Reference) -> sj.fitting.FitResult:
+    def _fitted(self, target: _models.Reference) -> sj.fitting.FitResult:
         count = self.count if self.error is None else sj.fitting.LeastCount(self.error)
         goal = (
             counted(self.count, "Gaussian")
@@ -286,8 +282,8 @@ class Fit:
     def _save(
         self,
         output: Path,
-        coefficients: Coefficients | None,
-        target: Reference,
+        coefficients: _models.Coefficients | None,
+        target: _models.Reference,
         fitted: sj.fitting.FitResult,
     ) -> None:
         surface, source = dict[str, Any](), dict[str, Any]()

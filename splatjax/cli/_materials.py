@@ -20,8 +20,8 @@ from ._terminal import (
     OptionalPath,
     UpAxis,
     check_output,
+    check_unused,
     note,
-    option_name,
     print_table,
     save_figure,
     stage,
@@ -34,7 +34,6 @@ _SCENES = {
     ".usdc": sj.io.save_usd,
 }
 _ACROSS = 8  # pictures in a row of a sheet
-_WHITE = 1.0  # radiance
 
 
 @dataclass(frozen=True)
@@ -72,10 +71,14 @@ class Materials:
         if self.pictures is not None:
             drawn = [_picture(name) for name, *_ in rows]
             drawn += [np.zeros_like(drawn[0])] * (-len(drawn) % _ACROSS)
-            lines = [drawn[i : i + _ACROSS] for i in range(0, len(drawn), _ACROSS)]
             from splatjax.plots import plot_pictures  # loads matplotlib
 
-            figure = plot_pictures(lines, [""] * _ACROSS, white=_WHITE, inches=1.6)
+            figure = plot_pictures(
+                [drawn[i : i + _ACROSS] for i in range(0, len(drawn), _ACROSS)],
+                [""] * _ACROSS,
+                white=1.0,
+                inches=1.6,
+            )
             for axes, (name, *_, source) in zip(figure.axes, rows, strict=False):
                 axes.set_title(f"{name}\n{source}", fontsize=6)
             for axes in figure.axes[len(rows) :]:
@@ -110,11 +113,8 @@ class Export:
         check_output(self.output, (".json", ".mtlx", *_SCENES))
         suffix = self.output.suffix.lower()
         for name, only in (("mm_per_unit", ".mtlx"), ("lux", ".glb")):
-            if getattr(self, name) != 1 and suffix != only:
-                raise ValueError(
-                    f"{option_name(name)} is {getattr(self, name)}, and {self.output} is no {only} "
-                    "file; leave the option out"
-                )
+            if suffix != only:
+                check_unused(self, [name], f"{self.output} is no {only} file")
         save = _SCENES.get(suffix)
         if save is not None:
             if not is_scene(Path(self.source)):
@@ -166,7 +166,7 @@ def _row(name: str) -> tuple[str, ...]:
 def _picture(name: str) -> np.ndarray:
     """Render a material on the bust, in its own color."""
     view = Render(material=name, albedo=False, count=20_000, scale=0.2, width=120, height=120)
-    return np.asarray(sj.render(*view.scene_and_camera(), view.settings).beauty)
+    return np.asarray(sj.render(*view.open()).beauty)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,8 +2,8 @@
 many media by one program for `--all`, and the report of a fit.
 """
 
-from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,7 +20,6 @@ Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carl
 Coefficients: TypeAlias = sj.Dipole | sj.LayeredMultipole | sj.scattering.Skin
 # Weights of the fit to a medium: the picture keeps its energy.
 MEDIUM_WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
-_BEYOND = sj.fitting.TransportModel.rule
 
 
 def model_by_name(model: Model | None, g: float) -> sj.fitting.AbstractModel:
@@ -82,8 +81,7 @@ def reference(
             )
         # In linear sRGB, under daylight.
         skin = sj.fitting.SkinModel(sj.io.spectrum_to_rgb(coefficients.wavelengths))
-        angles, profile = skin.angles(coefficients), skin.profile(coefficients)
-        return Reference(profile, skin.rule, None, skin.description, angles)
+        return _by_model(skin, coefficients)
     is_layered = isinstance(coefficients, sj.LayeredMultipole)
     model = model or ("dipole" if is_layered else "photon-beam")
     option = f"--model {model}{' with --single-scattering' if single_scattering else ''}"
@@ -96,38 +94,41 @@ def reference(
             "monte-carlo without --single-scattering"
         )
     if model == "monte-carlo":
-        return _walked(coefficients, photons, g, single_scattering)
-    if is_layered:
-        return Reference(coefficients)
-    chosen, medium = model_by_name(model, g), coefficients.medium
-    profile, description = chosen.profile(medium), chosen.description
-    if not single_scattering:
-        return Reference(profile, chosen.rule, None, description, chosen.angles(medium))
-    assert isinstance(profile, sj.scattering.PhotonBeam)
+        target = _walked(coefficients, photons, g)
+    elif is_layered:
+        target = Reference(coefficients)
+    else:
+        target = _by_model(model_by_name(model, g), coefficients.medium)
+    if is_layered or not single_scattering:
+        return target
+    return _without_single(target, coefficients.medium, g)
+
+
+def _by_model(model: sj.fitting.AbstractModel, optics: sj.Medium | sj.scattering.Skin) -> Reference:
+    return Reference(
+        model.profile(optics),
+        model.rule,
+        description=model.description,
+        angles=model.angles(optics),
+    )
+
+
+def _without_single(target: Reference, medium: sj.Medium, g: float) -> Reference:
+    """Separate the light that scatters once from a profile, and the angles of the rest."""
     single, half_space = sj.SingleScattering(medium), sj.scattering.HalfSpace(medium, g)
-    return _without_single(profile.multiply_scattered(), single, half_space, description)
+    scattered_once = single.directional_albedo(jnp.asarray(half_space.cosines()))
+    whole: Any = target.profile
+    is_exact = isinstance(whole, sj.scattering.PhotonBeam)
+    return replace(
+        target,
+        profile=whole.multiply_scattered() if is_exact else whole.without(single),
+        single=single,
+        description=f"{target.description}, without single scattering",
+        angles=half_space.angular_law(scattered_once),
+    )
 
 
-def _without_single(
-    profile: sj.gaussians.AbstractProfile,
-    single: sj.SingleScattering,
-    half_space: sj.scattering.HalfSpace,
-    description: str | None,
-) -> Reference:
-    """Combine a profile without single scattering, the single scattering, and the angles of the
-    rest.
-    """
-    cosines = jnp.asarray(half_space.cosines())
-    angles = half_space.angular_law(single.directional_albedo(cosines))
-    return Reference(profile, _BEYOND, single, f"{description}, without single scattering", angles)
-
-
-def _walked(
-    coefficients: sj.Dipole | sj.LayeredMultipole,
-    photons: int,
-    g: float,
-    single_scattering: bool,
-) -> Reference:
+def _walked(coefficients: sj.Dipole | sj.LayeredMultipole, photons: int, g: float) -> Reference:
     """Trace photons in single precision, which suffices; the fit uses double precision."""
     is_layered = isinstance(coefficients, sj.LayeredMultipole)
     layers = coefficients.layers if is_layered else [sj.Layer(coefficients.medium, jnp.inf)]
@@ -140,15 +141,14 @@ def _walked(
             g=g,
             progress=lambda done, _: report(done),
         )
-    profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), walk.profile())
-    description = f"Monte Carlo, {photons} photons"
-    if is_layered:
-        return Reference(profile, _BEYOND, None, description)
-    half_space = sj.scattering.HalfSpace(coefficients.medium, g)
-    if not single_scattering:
-        return Reference(profile, _BEYOND, None, description, half_space.angular_law())
-    single = sj.SingleScattering(coefficients.medium)
-    return _without_single(profile.without(single), single, half_space, description)
+    return Reference(
+        jax.tree.map(lambda leaf: leaf.astype(jnp.float64), walk.profile()),
+        sj.fitting.TransportModel.rule,
+        description=f"Monte Carlo, {photons} photons",
+        angles=None
+        if is_layered
+        else sj.scattering.HalfSpace(coefficients.medium, g).angular_law(),
+    )
 
 
 BATCH = 500  # media in one call
@@ -202,44 +202,26 @@ _DISTANCES = 7
 
 
 def print_fit(fitted: sj.fitting.FitResult, target: Reference) -> None:
-    """Print the Gaussians of a fit, their errors, and the relative error by distance."""
-    nodes, weights = (np.asarray(values) for values in target.rule.radii(target.profile))
-    begin = "" if target.rule.reaches_origin else f", fitted from {nodes[weights > 0].min():.2g} mm"
-    print_table(
-        [
-            *fitted.table(),
-            ("at r, mm", f"fit over profile, less 1{begin}"),
-            *_errors_by_distance(target.profile, fitted.gaussians, target.rule),
-        ]
-    )
-
-
-def _errors_by_distance(
-    profile: sj.gaussians.AbstractProfile,
-    gaussians: sj.SumOfGaussians,
-    rule: sj.scattering.AbstractRadialRule,
-) -> list[tuple[str, str]]:
-    """Return rows of relative errors, over the radii of the fit at which the light of any channel,
-    per logarithmic radius, is above a hundredth of its peak.
+    """Print the Gaussians of a fit, their errors, and the relative error by distance, over the
+    radii of the fit at which the light of any channel, per logarithmic radius, is above a hundredth
+    of its peak.
     """
+    profile, rule = target.profile, target.rule
     nodes, weights = (np.asarray(values) for values in rule.radii(profile))
-    measured = profile.known_radii()
-    least = max(nodes[weights > 0].min(), 0.1 * float(profile.length_scale().min()))
-    dense = (
+    first, measured = nodes[weights > 0].min(), profile.known_radii()
+    least = max(first, 0.1 * float(profile.length_scale().min()))
+    radii = (
         jnp.geomspace(least, nodes.max(), 400) if measured is None else measured[0][measured[0] > 0]
     )
-    light = np.asarray(dense)[:, None] ** 2 * np.asarray(profile(dense))
+    light = np.asarray(radii)[:, None] ** 2 * np.asarray(profile(radii))
     counts = light > 0.01 * light.max(axis=0)
     within = np.flatnonzero(counts.any(axis=1))
     places = np.unique(np.linspace(within[0], within[-1], _DISTANCES).round().astype(int))
-    errors = np.asarray(gaussians(dense) / profile(dense) - 1)
-    return [
-        (
-            f"{float(dense[i]):.3g}",
-            "  ".join(
-                f"{error:+.1%}" if counted else "-"
-                for error, counted in zip(errors[i], counts[i], strict=True)
-            ),
-        )
-        for i in places
-    ]
+    errors = np.asarray(fitted.gaussians(radii) / profile(radii) - 1)
+    begin = "" if rule.reaches_origin else f", fitted from {first:.2g} mm"
+    rows = [*fitted.table(), ("at r, mm", f"fit over profile, less 1{begin}")]
+    for i in places:
+        cells = zip(errors[i], counts[i], strict=True)
+        formatted = [f"{error:+.1%}" if is_counted else "-" for error, is_counted in cells]
+        rows.append((f"{float(radii[i]):.3g}", "  ".join(formatted)))
+    print_table(rows)

@@ -1,5 +1,6 @@
 """`splatjax recover`: from pictures of a known shape to a material."""
 
+import functools
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -152,8 +153,8 @@ class Recover:
                 sj.io.write_record(search, {"made of": dependencies, **values})
 
         gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, starts[0].eta.shape[0])))
-        compiling = ["compiling, for a minute or two; kept for later runs"]
-        with sj.cache.watched_compiling(lambda: note(compiling.pop()) if compiling else None):
+        message = "compiling, for a minute or two; kept for later runs"
+        with sj.cache.watched_compiling(functools.cache(functools.partial(note, message))):
             recovery = sj.inverse.recover(
                 observations,
                 splats,

@@ -4,28 +4,114 @@ animation, which resume after an interruption.
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 
 import splatjax as sj
 
-from ._scene import camera_of, check_alone, is_scene, scene_of_file
-from ._terminal import check_folder, check_options, check_output, complete, preview, stage
-from ._view import PictureOptions
+from ._scene import camera_of, draw, rough_picture, scene_contents
+from ._terminal import (
+    Rules,
+    check_folder,
+    check_options,
+    check_output,
+    complete,
+    note,
+    option_name,
+    preview,
+    stage,
+)
+from ._view import ViewOptions
 
 _LARGEST = 16_383  # pixels along a side of a WebP file
 _MOST_FRAMES = 10_000  # the most that four digits can number
+_NOT_IN_PICTURES = ("splats", "output", "fps", "quiet", "half", "camera_file", "camera_unit")
+_note_once = functools.cache(note)
 _DIRECTIONS = 128  # number of shadow maps of an environment that turns about the body
 
 
-Rendered = tuple[sj.Frame, sj.Material, tuple[sj.scene.AbstractLight, ...], sj.Camera]
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions(ViewOptions):
+    """Options for the contents of a picture's files."""
+
+    #: Background of the PNG: black, transparent, or the environment. The EXR has coverage and no
+    #: background.
+    background: Literal["black", "transparent", "environment"] = "black"
+    #: Write the EXR in half precision, except for depth and position.
+    half: bool = False
+
+    def check(self, more_rules: Rules | None = None) -> None:
+        rules: Rules = {
+            "background": (
+                self.background != "environment" or self.environment_name is not None,
+                "be black or transparent with single lights and no --environment",
+            ),
+        }
+        super().check(rules | (more_rules or {}))
+
+    def write(
+        self,
+        path: Path,
+        frame: sj.Frame,
+        material: sj.Material,
+        lights: tuple[sj.scene.AbstractLight, ...],
+        camera: sj.Camera,
+        settings: sj.RenderSettings,
+    ) -> tuple[Path, Path]:
+        """Write the picture with all its layers, and the PNG file beside it; return both paths."""
+        picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
+        scene = scene_contents(self, settings, path.parent, material, lights, camera)
+        # The sum of all layers belongs to no Gaussian.
+        is_summed = isinstance(
+            settings.diffuser, sj.diffusion.ExitanceDiffuser | sj.diffusion.ShapeDiffuser
+        )
+        widths = None if is_summed else material.gaussians.variances.tolist()
+        sj.write_exr(
+            path,
+            frame,
+            variances=widths,
+            manifest=self.manifest() | {"scene": scene},
+            camera=camera,
+            half=self.half,
+        )
+        unresolved = np.asarray(frame.unresolved_fraction) > 0.5
+        if widths and self.scattering and unresolved.any():
+            deviations = ", ".join(f"{width:.3g}" for width in np.sqrt(widths)[unresolved])
+            _note_once(
+                "unresolved, because they are narrower than the splats: Gaussians of standard "
+                f"deviations {deviations} mm; more splats resolve them, or a smaller body (scale)"
+            )
+        if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
+            shown = np.asarray(lights[0].behind(frame, camera))
+        elif self.background == "transparent":
+            colors = np.repeat(shown, 3 // shown.shape[-1], axis=-1)  # for a scene in gray
+            shown = np.concatenate([colors, np.asarray(frame.coverage)[..., None]], axis=-1)
+        sj.write_png(picture, shown, exposure=self.exposure)
+        return path, picture
+
+    def manifest(self) -> dict[str, Any]:
+        """Return everything on which the pictures depend besides a scene's file: options by name,
+        contents of their files, and versions.
+        """
+        versions = {"splatjax": sj.__version__, "jax": jax.__version__}
+        if self.table is not None:
+            return versions
+        options = {option_name(n): v for n, v in asdict(self).items() if n not in _NOT_IN_PICTURES}
+        if self.environment and self.environment not in sj.io.ENVIRONMENTS:
+            options["--environment"] = _identified(Path(self.environment))
+        return options | {
+            "splats": _identified(self.splats) if self.splats else "the built-in bust",
+            "contents of --material": sj.io.material_path(self.material).read_text("utf-8"),
+            "precision": str(jnp.result_type(float)),
+            **versions,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,53 +170,33 @@ class Render(PictureOptions):
             )
         if self.camera_file is not None:
             self.camera(tuple, self.azimuth)  # its file is read before anything is made
-        options = self
-        if self._scene:
-            check_alone(self)
-            with stage(f"loading {self._scene.path}"):
-                scene, camera, settings = sj.io.load_scene(self._scene.path)
-            rendered = self._drawn(scene, camera, settings)
-            options = replace(self, **self._scene.entries["settings"])
-        elif self.splats and self.stream:
-            rendered = self._streamed(self.splats)
+        if self.table is None and self.splats and self.stream:
+            pictured = self._streamed(self.splats)
         else:
-            rendered = self._drawn(*self.scene_and_camera(), self.settings)
-        options.note_unresolved_layers(*rendered[:2])
+            scene, camera, settings = self.open()
+            frame = self._drawn(scene, camera, settings)
+            pictured = frame, scene.material, scene.lights, camera, settings
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
-            written = options.write(self.output, *rendered)
+            written = self.write(self.output, *pictured)
         print(*written, sep="\n")
-
-    @functools.cached_property
-    def _scene(self) -> Any:
-        return sj.io.scene_table(self.splats) if self.splats and is_scene(self.splats) else None
 
     def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         if self.camera_file is None:
             return super().camera(parts, azimuth)
         return camera_of(self.camera_file, self.camera_unit, self.up, self.height, self.scale)
 
-    def record(self, folder: Path, *scene: Any) -> dict[str, Any]:
-        if not self._scene:
-            return super().record(folder, *scene)
-        return {
-            "splatjax": sj.__version__,
-            "jax": jax.__version__,
-            "scene": scene_of_file(self._scene, self.settings, folder, *scene),
-        }
-
-    def _drawn(self, scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings) -> Rendered:
+    def _drawn(self, scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings) -> sj.Frame:
         # Sample the lights before the preview, which is drawn during the first compilation, so that
         # no compilation is nested.
         samples = [sample for light in scene.lights for sample in light.samples()]
         with preview(lambda side: rough_picture(scene, samples, camera, self.exposure, side)):
             with stage("planning"):
                 plan = sj.make_plan(scene, camera, settings)
-            size = f"{camera.width} x {camera.height}"
-            with stage(f"rendering {scene.splats.count} splats at {size}"):
-                frame = draw(scene, camera, settings, plan)
-        return frame, scene.material, scene.lights, camera
+            count, width, height = scene.splats.count, camera.width, camera.height
+            with stage(f"rendering {count} splats at {width} x {height}"):
+                return draw(scene, camera, settings, plan)
 
-    def _streamed(self, path: Path) -> Rendered:
+    def _streamed(self, path: Path) -> tuple[Any, ...]:
         file = sj.SplatFile(path, self.stream, up=self.up)
 
         def parts() -> Iterable[sj.Splats]:
@@ -144,7 +210,7 @@ class Render(PictureOptions):
             frame = sj.render_streamed(
                 parts, lights, material, camera, report=lambda task, done: report(done, task)
             )
-        return frame, material, lights, camera
+        return frame, material, lights, camera, self.settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,14 +252,13 @@ class Turntable(PictureOptions):
     #: Frames per second of turntable.webp, from 0.1 to 60.
     fps: float = 24.0
 
+    table = None  # a scene's file has one camera
+
     def run(self) -> None:
         in_webp = f"be at most {_LARGEST} in turntable.webp"
         self.check(
             {
-                "frames": (
-                    1 <= self.frames <= _MOST_FRAMES,
-                    f"lie between 1 and {_MOST_FRAMES}",
-                ),
+                "frames": (1 <= self.frames <= _MOST_FRAMES, f"lie between 1 and {_MOST_FRAMES}"),
                 "width": (1 <= self.width <= _LARGEST, in_webp),
                 "height": (1 <= self.height <= _LARGEST, in_webp),
                 "degrees": (
@@ -246,7 +311,7 @@ class Turntable(PictureOptions):
         cameras = [self.camera(lambda: [splats], azimuth) for azimuth, _ in places]
         keeps_shadows = self.environment_name is not None and self.turn != "camera"
         if keeps_shadows:
-            even = partial(replace, directions=sj.scene.even_directions(_DIRECTIONS))
+            even = functools.partial(replace, directions=sj.scene.even_directions(_DIRECTIONS))
             scenes = [replace(scene, lights=tuple(map(even, scene.lights))) for scene in scenes]
         # One plan serves all frames, so that an interruption does not change any.
         with stage(f"planning {self.frames} frames"):
@@ -262,53 +327,10 @@ class Turntable(PictureOptions):
 
         def make(i: int) -> None:
             frame = draw(scenes[i], cameras[i], settings, plan, light)
-            self.note_unresolved_layers(frame, material)
-            self.write(paths[i][0], frame, material, scenes[i].lights, cameras[i])
+            self.write(paths[i][0], frame, material, scenes[i].lights, cameras[i], settings)
 
         return make
 
 
-def draw(
-    scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings, plan: sj.Plan, light=None
-) -> sj.Frame:
-    """Render, and wait for the picture; the arguments are those of `sj.render`.
-
-    **Raises:** `ValueError` when the plan's capacity is exceeded.
-    """
-    frame = jax.block_until_ready(sj.render(scene, camera, settings, plan, light=light))
-    if not frame.overflow <= 0:
-        raise ValueError(
-            f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times the capacity "
-            "is needed"
-        )
-    return frame
-
-
-def rough_picture(
-    scene: sj.Scene, samples: Sequence[Any], camera: sj.Camera, exposure: float, side: int
-) -> list:
-    """Draw the centers of splats, matte and under samples of the lights, by NumPy alone, which
-    compiles nothing. The longer side has at most `side` pixels, fewer for few splats; the height is
-    even. Return rows of red, green and blue up to 255.
-    """
-    scene, camera, lights = jax.device_get((scene, camera, samples))
-    # A part of millions of splats suffices.
-    splats = jax.tree.map(lambda leaf: leaf[:: 1 + len(leaf) // 2**19], scene.splats)
-    lengths = np.asarray([camera.width, camera.height])
-    side = max(2, min(side, 0.5 * splats.count**0.5))  # so that few pixels have no splat
-    size = 2 * np.maximum(np.rint(side / 2 * lengths / lengths.max()), 1).astype(int)
-    albedo = 1.0 if splats.albedo is None else splats.albedo
-    color = (albedo * scene.material.gaussians.weights.sum(axis=0) / np.pi) * sum(
-        np.maximum(splats.normals @ -light.direction, 0)[:, None] * light.irradiance
-        for light in lights
-    )
-    local = (splats.centers - camera.position) @ camera.rotation.T
-    # Draw splats that face the camera from far to near: nearer ones cover farther ones.
-    order = np.argsort(-local[:, 2])
-    order = order[np.sum(local * (splats.normals @ camera.rotation.T), axis=1)[order] < 0]
-    middle = size * np.asarray(camera.principal_pixel) / lengths
-    place = camera.focal_length * size[1] * local[:, :2] / local[:, 2:] + middle
-    column, row = np.clip(place, 0, size - 1)[order].astype(int).T
-    picture = np.zeros((size[1], size[0], 3))
-    picture[row, column] = color[order]
-    return np.rint(255 * sj.io.linear_to_srgb(picture * 2.0**exposure)).astype(int).tolist()
+def _identified(path: Path) -> str:
+    return f"{path.name}, {sj.io.fingerprint(path)}"

@@ -1,15 +1,18 @@
-"""Scenes of the command line: cameras from files, and the contents of scene files."""
+"""Scenes of the command line: cameras from files, the contents of scene files, and a rough picture
+of a scene.
+"""
 
+import math
 import os
-from dataclasses import MISSING, fields, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
+
 import splatjax as sj
-
-from ._terminal import option_name
-
-_BESIDE = {"splats", "output", "background", "exposure", "half", "quiet", "host", "port"}
 
 
 def camera_of(source: str, mm_per_unit: float, up: str, height: int, scale: float) -> sj.Camera:
@@ -21,61 +24,94 @@ def camera_of(source: str, mm_per_unit: float, up: str, height: int, scale: floa
     return replace(sj.io.resized(camera, height), position=camera.position * scale)
 
 
-def is_scene(path: Path) -> bool:
+def is_scene(path: Path | None) -> bool:
     """Return whether a file is, by its suffix, a scene, or a picture whose manifest is a scene."""
-    return path.suffix.lower() in (".toml", ".exr")
+    return path is not None and path.suffix.lower() in (".toml", ".exr")
 
 
-def check_alone(options: Any) -> None:
-    """Raise `ValueError` for an option that the scene's file specifies."""
-    for field in fields(options):
-        value = getattr(options, field.name)
-        if field.name not in _BESIDE and field.default not in (value, MISSING):
-            raise ValueError(
-                f"{option_name(field.name)} is {value}, and {options.splats} describes the whole "
-                "scene; change the file, or leave the option out"
-            )
-
-
-def scene_of_options(options: Any, images: str | list[str], *record: Any) -> dict[str, Any]:
-    """Return the contents of a scene's file, from options and the images of lights; `record` is as
-    for `scene_in_folder`.
-    """
-    body = {"file": str(options.splats)} if options.splats else {"bust": options.count}
-    body |= {"up": options.up, "scale": options.scale, "albedo": options.albedo}
-    g = sj.io.load_mean_cosine(options.material)
-    return scene_in_folder(Path(), body, images, g, *record)
-
-
-def scene_of_file(table: Any, *record: Any) -> dict[str, Any]:
-    """Return the contents of a scene's file, from the table of another file; `record` as above."""
-    images = [light.get("image", "") for light in table.entries["lights"]]
-    g = sj.io.load_mean_cosine(sj.io.material_of_scene(table))
-    return scene_in_folder(table.folder, table.entries["splats"], images, g, *record)
-
-
-def scene_in_folder(
-    old: Path,
-    body: dict[str, Any],
-    images: str | list[str],
-    g: float,
+def scene_contents(
+    options: Any,
     settings: sj.RenderSettings,
     folder: Path,
     material: sj.Material,
     lights: tuple[sj.scene.AbstractLight, ...],
     camera: sj.Camera,
+    images: list[str] | None = None,
 ) -> dict[str, Any]:
-    """Return the contents of a scene's file in a folder. The files of the body and the images, one
-    for each light or one for all, are named relative to an old folder; `g` is the material's mean
-    cosine.
+    """Return the contents of a scene's file in a folder. The body and the images of the lights are
+    existing files, of options or of the scene's file that they name.
+
+    **Arguments:**
+
+    - `images`: an image for each light; by default the environment of the options.
     """
+    if options.table is None:
+        old, images = Path(), images or [options.environment_name or ""] * len(lights)
+        body = {"file": str(options.splats)} if options.splats else {"bust": options.count}
+        body |= {"up": options.up, "scale": options.scale, "albedo": options.albedo}
+    else:
+        old, body = options.table.folder, options.table.entries["splats"]
+        images = [light.get("image", "") for light in options.table.entries["lights"]]
 
     def moved(name: str) -> str:
         return name if name in sj.io.ENVIRONMENTS else os.path.relpath(old / name, folder)
 
     body = body | {key: moved(body[key]) for key in ("file", "mesh") if key in body}
-    images = [images] * len(lights) if isinstance(images, str) else images
     tables = [
         sj.io.plain_light(light, moved(image)) for light, image in zip(lights, images, strict=True)
     ]
+    g = sj.io.load_mean_cosine(options.material_source)
     return sj.io.plain_scene(body, material, camera, tables, settings, g)
+
+
+def draw(
+    scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings, plan: sj.Plan, light=None
+) -> sj.Frame:
+    """Render, and wait for the picture; the arguments are those of `sj.render`.
+
+    **Raises:** `ValueError` when the plan's capacity is exceeded.
+    """
+    frame = jax.block_until_ready(sj.render(scene, camera, settings, plan, light=light))
+    if not frame.overflow <= 0:
+        raise ValueError(
+            f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times the capacity "
+            "is needed"
+        )
+    return frame
+
+
+def rough_picture(
+    scene: sj.Scene, samples: Sequence[Any], camera: sj.Camera, exposure: float, side: int
+) -> list:
+    """Draw the centers of splats, matte and under samples of the lights, by NumPy alone, which
+    compiles nothing. The longer side has at most `side` pixels, fewer for few splats; the height is
+    even. Return rows of red, green and blue up to 255.
+    """
+    scene, camera, lights = jax.device_get((scene, camera, samples))
+    # A part of millions of splats suffices.
+    splats = jax.tree.map(lambda leaf: leaf[:: 1 + len(leaf) // 2**19], scene.splats)
+    lengths = np.asarray([camera.width, camera.height])
+    side = max(2, min(side, 0.5 * splats.count**0.5))  # so that few pixels have no splat
+    size = 2 * np.maximum(np.rint(side / 2 * lengths / lengths.max()), 1).astype(int)
+    albedo = 1.0 if splats.albedo is None else splats.albedo
+    color = (albedo * scene.material.gaussians.weights.sum(axis=0) / np.pi) * sum(
+        np.maximum(splats.normals @ -light.direction, 0)[:, None] * light.irradiance
+        for light in lights
+    )
+    local = (splats.centers - camera.position) @ camera.rotation.T
+    # Draw splats that face the camera from far to near: nearer ones cover farther ones.
+    order = np.argsort(-local[:, 2])
+    order = order[np.sum(local * (splats.normals @ camera.rotation.T), axis=1)[order] < 0]
+    middle = size * np.asarray(camera.principal_pixel) / lengths
+    place = camera.focal_length * size[1] * local[:, :2] / local[:, 2:] + middle
+    column, row = np.clip(place, 0, size - 1)[order].astype(int).T
+    picture = np.zeros((size[1], size[0], 3))
+    picture[row, column] = color[order]
+    return np.rint(255 * sj.io.linear_to_srgb(picture * 2.0**exposure)).astype(int).tolist()
+
+
+def direction_to(azimuth: float, elevation: float) -> np.ndarray:
+    """Return the unit vector from the middle towards a place on the sky, given in degrees."""
+    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
+    across = math.cos(elevation)
+    return np.asarray([math.sin(azimuth) * across, math.sin(elevation), math.cos(azimuth) * across])

@@ -5,21 +5,17 @@ import tomllib
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated
 
 import numpy as np
 import tyro
 
 import splatjax as sj
-from splatjax._records import check_installed
-from splatjax.studio import AsFile, Page, Session
+from splatjax.studio import Page, Session
 
-from ._scene import check_alone, is_scene, scene_of_file, scene_of_options
-from ._terminal import OptionalPath, check_folder, stage
+from ._scene import scene_contents
+from ._terminal import OptionalPath, check_folder
 from ._view import ViewOptions
-
-# Scene, camera, settings, the source of the material, and the function for the scene's file.
-Opened: TypeAlias = tuple[sj.Scene, sj.Camera, sj.RenderSettings, Any, AsFile]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,12 +57,10 @@ class Studio(ViewOptions):
 
     def page(self) -> Page:
         """Open the page of the scene, and return it."""
-        check_installed("the page of the studio", "viser")
-        observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
-        if self.splats is not None and is_scene(self.splats):
-            scene, camera, settings, material, as_file = self._of_file(self.splats)
-        else:
-            scene, camera, settings, material, as_file = self._of_options()
+        observations, images = [], None
+        if self.pictures is not None:
+            observations, images = sj.io.read_observations(self.pictures), _images(self.pictures)
+        scene, camera, settings = self.open()
         if observations:
             scene, camera = replace(scene, lights=observations[0].lights), observations[0].camera
         centers, forward = np.asarray(scene.splats.centers), camera.rotation[2]
@@ -78,29 +72,21 @@ class Studio(ViewOptions):
             target,
             settings,
             exposure=self.exposure,
-            skin=sj.io.load_skin(material),
-            g=sj.io.load_mean_cosine(material),
+            skin=sj.io.load_skin(self.material_source),
+            g=sj.io.load_mean_cosine(self.material_source),
         )
         return Page(
-            session, self.output, as_file, observations=observations, host=self.host, port=self.port
+            session,
+            self.output,
+            partial(scene_contents, self, settings, images=images),
+            observations=observations,
+            host=self.host,
+            port=self.port,
         )
 
-    def _of_options(self) -> Opened:
-        scene, camera = self.scene_and_camera()
-        images = self.environment_name or ""
-        if self.pictures is not None:
-            first = tomllib.loads(self.pictures.read_text())["pictures"][0]
-            images = [light.get("image", "") for light in first["lights"]]
-            images = [
-                i if i in sj.io.ENVIRONMENTS else str(self.pictures.parent / i) for i in images
-            ]
-        as_file = partial(scene_of_options, self, images, self.settings)
-        return scene, camera, self.settings, self.material, as_file
 
-    def _of_file(self, path: Path) -> Opened:
-        check_alone(self)
-        with stage(f"loading {path}"):
-            table = sj.io.scene_table(path)
-            scene, camera, settings = sj.io.load_scene(path)
-        material = sj.io.material_of_scene(table)
-        return scene, camera, settings, material, partial(scene_of_file, table, settings)
+def _images(pictures: Path) -> list[str]:
+    """List the images of the lights of the first of some pictures."""
+    lights = tomllib.loads(pictures.read_text())["pictures"][0]["lights"]
+    images = [light.get("image", "") for light in lights]
+    return [name if name in sj.io.ENVIRONMENTS else str(pictures.parent / name) for name in images]

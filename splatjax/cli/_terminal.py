@@ -6,9 +6,11 @@ Explanations of more than a line are in `help`, because line breaks in docstring
 """
 
 import contextlib
+import functools
 import os
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Container, Generator, Mapping, Sequence
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,8 +19,7 @@ import tyro
 from jax.extend.backend import clear_backends
 from rich.console import Console
 
-from splatjax.cache import watched_compiling
-from splatjax.io import atomic_path, read_record, write_record
+import splatjax as sj
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
@@ -44,6 +45,16 @@ def check_options(command: Any, rules: Rules) -> None:
             raise ValueError(f"{option_name(field)} is {formatted}; it must {expected}")
 
 
+def check_unused(command: Any, names: Container[str], reason: str) -> None:
+    """Raise `ValueError` for the first of some options that is given, and would have no effect."""
+    for field in fields(command):
+        value = getattr(command, field.name)
+        if field.name in names and field.default not in (value, MISSING):
+            raise ValueError(
+                f"{option_name(field.name)} is {value}, and {reason}; leave the option out"
+            )
+
+
 def check_output(path: Path | None, suffixes: tuple[str, ...]) -> None:
     """Raise `ValueError` for a name with another suffix or an existing folder of this name, and
     `FileNotFoundError` for a missing folder.
@@ -65,7 +76,7 @@ def check_folder(path: Path) -> None:
 
 def save_figure(figure: Any, path: Path) -> None:
     """Write a figure of matplotlib, completely or not at all, and print its path."""
-    with atomic_path(path) as temporary:
+    with sj.io.atomic_path(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:].lower())
     print(path)
 
@@ -99,8 +110,7 @@ def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
     note(f"{title}: {time.perf_counter() - begin:.1f} s")
 
 
-@contextlib.contextmanager
-def preview(draw: Callable[[int], list]) -> Generator[None]:
+def preview(draw: Callable[[int], list]) -> contextlib.AbstractContextManager[None]:
     """Show a small picture when the first compilation starts, once, if stderr is a terminal with
     colors. If all programs are cached, the requested picture is ready just as soon.
 
@@ -109,9 +119,7 @@ def preview(draw: Callable[[int], list]) -> Generator[None]:
     - `draw`: computes the picture from the largest number of pixels of a side: an even number of
       rows of red, green and blue up to 255.
     """
-    pending = [draw]
-    with watched_compiling(lambda: _show(pending.pop()) if pending else None):
-        yield
+    return sj.cache.watched_compiling(functools.cache(lambda: _show(draw)))
 
 
 def _show(draw: Callable[[int], list]) -> None:
@@ -124,8 +132,8 @@ def _show(draw: Callable[[int], list]) -> None:
     ):
         return
     note("a preview, without scattering, shadows and gloss; the picture is being compiled:")
-    pixels = draw(min(64, CONSOLE.width, 2 * CONSOLE.height - 8))  # a character shows two
-    colors = [[f"rgb({red},{green},{blue})" for red, green, blue in row] for row in pixels]
+    side = min(64, CONSOLE.width, 2 * CONSOLE.height - 8)  # a character shows two pixels
+    colors = [[f"rgb({red},{green},{blue})" for red, green, blue in row] for row in draw(side)]
     for above, below in zip(colors[::2], colors[1::2], strict=True):
         CONSOLE.print("".join(f"[{a} on {b}]▀[/]" for a, b in zip(above, below, strict=True)))
 
@@ -176,7 +184,7 @@ def complete(
     if share:
         make = prepare()
         folder.mkdir(exist_ok=True)
-        write_record(record_path, record)
+        sj.io.write_record(record_path, record)
         try:
             with stage(what, len(share)) as report:
                 for number, i in enumerate(share, 1):
@@ -203,7 +211,7 @@ def _check_record(path: Path, record: Mapping[str, Any], items: Sequence[tuple[P
     files = [file for item in items for file in item if file.exists()]
     if files and not path.exists():
         raise ValueError(f"{files[0]}: has no record of its settings; {remedy}")
-    before = read_record(path) if path.exists() else record
+    before = sj.io.read_record(path) if path.exists() else record
     changes = [
         f"{name} is {record.get(name)}, but was {before.get(name)}"
         for name in sorted(before.keys() | record.keys())
@@ -226,12 +234,10 @@ def process_index_and_count() -> tuple[int, int]:
     counts = [os.environ[name] for name in _COUNTS if name in os.environ]
     if not counts or counts[0] in ("0", "1"):
         return 0, 1
-    names = {"num_processes": "JAX_NUM_PROCESSES", "process_id": "JAX_PROCESS_ID"}
     try:
-        numbers: dict[str, Any] = {
-            key: int(os.environ[name]) for key, name in names.items() if name in os.environ
-        }
-        jax.distributed.initialize(**numbers)
+        jax.distributed.initialize(
+            num_processes=_number("JAX_NUM_PROCESSES"), process_id=_number("JAX_PROCESS_ID")
+        )
     except (ValueError, TypeError) as error:
         raise ValueError(
             f"several processes were started, but their settings are incomplete: {error} Set "
@@ -242,3 +248,8 @@ def process_index_and_count() -> tuple[int, int]:
     jax.distributed.shutdown()
     clear_backends()
     return place
+
+
+def _number(variable: str) -> int | None:
+    """Return the number in an environment variable, `None` if it is not set."""
+    return int(os.environ[variable]) if variable in os.environ else None

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,16 +15,23 @@ import splatjax as sj
 from splatjax._memory import check_memory
 from splatjax.render import BYTES_PER_PIXEL, BYTES_PER_SPLAT, check_displayable
 
-from ._scene import scene_of_options
-from ._terminal import OptionalFloat, Rules, UpAxis, check_options, note, option_name, stage
+from ._scene import direction_to, is_scene
+from ._terminal import (
+    OptionalFloat,
+    Rules,
+    UpAxis,
+    check_options,
+    check_unused,
+    note,
+    stage,
+)
 
 # Degrees: the fill is beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
 # Options of the single light, with their defaults if another of them is given.
 _SINGLE_LIGHT = {"light_azimuth": -20.0, "light_elevation": 30.0, "fill": 0.1}
-ENVIRONMENTS = sj.io.ENVIRONMENTS
-_NOT_IN_PICTURES = ("splats", "output", "fps", "quiet", "half", "camera_file", "camera_unit")
-_note_once = functools.cache(note)
+# Options that are given beside a scene's file.
+_BESIDE_SCENES = {"splats", "output", "background", "exposure", "half", "quiet", "host", "port"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,12 +98,8 @@ class ViewOptions:
         """
         finite, positive = "be a finite number", "be 1 or more"
         azimuth, elevation, fill = self.single_light
-        for name in _SINGLE_LIGHT:
-            if self.environment is not None and getattr(self, name) is not None:
-                raise ValueError(
-                    f"{option_name(name)} is for a single light, and --environment replaces it; "
-                    "leave one of the two out"
-                )
+        if self.environment is not None:
+            check_unused(self, _SINGLE_LIGHT, "--environment replaces the single light")
         rules: Rules = {
             "fill": (0 <= fill < math.inf, "be 0 or more"),
             "scale": (0 < self.scale < math.inf, "be a positive factor"),
@@ -147,17 +150,43 @@ class ViewOptions:
     @functools.cached_property
     def _environment(self) -> sj.EnvironmentLight | None:
         name = self.environment_name
-        if name in ENVIRONMENTS:
-            return sj.EnvironmentLight(ENVIRONMENTS[name]())
+        if name in sj.io.ENVIRONMENTS:
+            return sj.EnvironmentLight(sj.io.ENVIRONMENTS[name]())
         if name and not Path(name).is_file():
             raise ValueError(
-                f"{name}: there is no such file; built in are {', '.join(ENVIRONMENTS)}"
+                f"{name}: there is no such file; built in are {', '.join(sj.io.ENVIRONMENTS)}"
             )
         return sj.io.load_environment(name) if name else None
 
     @property
     def settings(self) -> sj.RenderSettings:
         return sj.RenderSettings(bounces=self.bounces, diffuser=sj.io.DIFFUSERS[self.diffusion])
+
+    @functools.cached_property
+    def table(self) -> Any:
+        """Return the contents of the file that describes the whole scene, `None` without one."""
+        if self.splats is None or not is_scene(self.splats):
+            return None
+        reason = f"{self.splats} describes the whole scene, and may be changed"
+        check_unused(self, vars(self).keys() - _BESIDE_SCENES, reason)
+        return sj.io.scene_table(self.splats)
+
+    @property
+    def material_source(self) -> Any:
+        """Return the name, path or tables of the material."""
+        return self.material if self.table is None else sj.io.material_of_scene(self.table)
+
+    def open(self) -> tuple[sj.Scene, sj.Camera, sj.RenderSettings]:
+        """Return scene, camera and settings: those of the scene's file, or of the options, with a
+        camera that sees all of the splats.
+        """
+        if self.table is not None:
+            with stage(f"loading {self.splats}"):
+                return sj.io.load_scene(self.table.path)
+        splats, material = self.load()
+        lights = self.lights(material, self.azimuth, self.single_light[0])
+        camera = self.camera(lambda: [splats], self.azimuth)
+        return sj.Scene(splats, lights, material), camera, self.settings
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
@@ -184,25 +213,15 @@ class ViewOptions:
                 "light; --no-albedo gives the color of the material"
             )
         if material.channels == 1:  # the same weights for red, green and blue
-            weights = jnp.tile(material.gaussians.weights, 3)
-            gaussians = sj.SumOfGaussians(material.gaussians.variances, weights)
-            names = "single_scattering", "angles", "medium"
-            terms = jax.tree.map(
-                lambda leaf: jnp.tile(leaf, 3), {name: getattr(material, name) for name in names}
-            )
-            material = replace(material, gaussians=gaussians, **terms)
+            tiled = jax.tree.map(lambda leaf: jnp.tile(leaf, 3) if leaf.ndim else leaf, material)
+            gaussians = replace(tiled.gaussians, variances=material.gaussians.variances)
+            material = replace(tiled, gaussians=gaussians)
         return material if self.scattering else material.opaque()
 
     def adjusted(self, splats: sj.Splats) -> sj.Splats:
         """Return splats at the scale of the options, with or without their maps."""
         splats = splats if self.scale == 1 else splats.scaled(self.scale)
         return splats if self.albedo else splats.without_maps()
-
-    def scene_and_camera(self) -> tuple[sj.Scene, sj.Camera]:
-        """Return the scene, and the camera that sees all of it."""
-        splats, material = self.load()
-        lights = self.lights(material, self.azimuth, self.single_light[0])
-        return sj.Scene(splats, lights, material), self.camera(lambda: [splats], self.azimuth)
 
     def lights(
         self, material: sj.Material, azimuth: float, light_azimuth: float
@@ -232,9 +251,8 @@ class ViewOptions:
         just fits the narrower side of the picture.
         """
         bodies = (np.asarray(part.centers) for part in parts())
-        boxes = [(np.min(body, axis=0), np.max(body, axis=0)) for body in bodies]
-        low, high = np.min([box[0] for box in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-        middle = (low + high) / 2
+        corners = [bound(body, axis=0) for body in bodies for bound in (np.min, np.max)]
+        middle = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
         reaches = [
             np.linalg.norm(np.asarray(part.centers) - middle, axis=1) + np.asarray(part.radii)
             for part in parts()
@@ -244,87 +262,3 @@ class ViewOptions:
         half_angle = math.atan(math.tan(math.radians(self.fov) / 2) * narrower)
         eye = middle + radius / math.sin(half_angle) * direction_to(azimuth, self.elevation)
         return sj.Camera.look_at(eye, middle, fov=self.fov, width=self.width, height=self.height)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PictureOptions(ViewOptions):
-    """Options for the contents of a picture's files."""
-
-    #: Background of the PNG: black, transparent, or the environment. The EXR has coverage and no
-    #: background.
-    background: Literal["black", "transparent", "environment"] = "black"
-    #: Write the EXR in half precision, except for depth and position.
-    half: bool = False
-
-    def check(self, more_rules: Rules | None = None) -> None:
-        rules: Rules = {
-            "background": (
-                self.background != "environment" or self.environment_name is not None,
-                "be black or transparent with single lights and no --environment",
-            ),
-        }
-        super().check(rules | (more_rules or {}))
-
-    def write(
-        self,
-        path: Path,
-        frame: sj.Frame,
-        material: sj.Material,
-        lights: tuple[sj.scene.AbstractLight, ...],
-        camera: sj.Camera,
-    ) -> tuple[Path, Path]:
-        """Write the picture with all its layers, and the PNG file beside it; return both paths."""
-        picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
-        record = self.record(path.parent, material, lights, camera)
-        summed = self.diffusion != "clusters"  # the only layer then belongs to no Gaussian
-        widths = None if summed else material.gaussians.variances.tolist()
-        sj.write_exr(path, frame, variances=widths, manifest=record, camera=camera, half=self.half)
-        if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
-            shown = np.asarray(lights[0].behind(frame, camera))
-        elif self.background == "transparent":
-            colors = np.repeat(shown, 3 // shown.shape[-1], axis=-1)  # for a scene in gray
-            shown = np.concatenate([colors, np.asarray(frame.coverage)[..., None]], axis=-1)
-        sj.write_png(picture, shown, exposure=self.exposure)
-        return path, picture
-
-    def record(self, folder: Path, *scene: Any) -> dict[str, Any]:
-        """Return the manifest of a picture in a folder, for its material, lights and camera."""
-        record = scene_of_options(self, self.environment_name or "", self.settings, folder, *scene)
-        return self.manifest() | {"scene": record}
-
-    def manifest(self) -> dict[str, Any]:
-        """Return everything on which the pictures depend: options by name, contents of their files,
-        and versions.
-        """
-        options = {option_name(n): v for n, v in asdict(self).items() if n not in _NOT_IN_PICTURES}
-        splats = f"{self.splats.name}, {sj.io.fingerprint(self.splats)}" if self.splats else None
-        if self.environment and self.environment not in ENVIRONMENTS:
-            path = Path(self.environment)
-            options[option_name("environment")] = f"{path.name}, {sj.io.fingerprint(path)}"
-        return options | {
-            "splats": splats or "the built-in bust",
-            "contents of --material": sj.io.material_path(self.material).read_text("utf-8"),
-            "precision": str(jnp.result_type(float)),
-            "splatjax": sj.__version__,
-            "jax": jax.__version__,
-        }
-
-    def note_unresolved_layers(self, frame: sj.Frame, material: sj.Material) -> None:
-        """Print the layers that are narrower than the splats."""
-        if self.diffusion != "clusters":
-            return
-        unresolved = np.asarray(frame.unresolved_fraction) > 0.5
-        widths = np.sqrt(np.asarray(material.gaussians.variances))[unresolved]
-        if self.scattering and len(widths):
-            _note_once(
-                "unresolved, because they are narrower than the splats: Gaussians of standard "
-                f"deviations {', '.join(f'{w:.3g}' for w in widths)} mm; more splats resolve "
-                "them, or a smaller body (scale)"
-            )
-
-
-def direction_to(azimuth: float, elevation: float) -> np.ndarray:
-    """Return the unit vector from the middle towards a place on the sky, given in degrees."""
-    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
-    across = math.cos(elevation)
-    return np.asarray([math.sin(azimuth) * across, math.sin(elevation), math.cos(azimuth) * across])

@@ -4,7 +4,7 @@ import pytest
 from bodies import PLAIN
 
 import splatjax as sj
-from splatjax.cli import _render, _view
+from splatjax.cli import _render
 from splatjax.io import _scenes
 
 
@@ -21,7 +21,7 @@ def own_cache(tmp_path_factory, jax_settings):
 def plain():
     """Plain renderers, whose program is small: what is tested here does not depend on them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_view.PictureOptions, "settings", PLAIN)
+        patch.setattr(_render.PictureOptions, "settings", PLAIN)
         patch.setattr(_scenes, "RenderSettings", lambda **_: PLAIN)
         yield
 

@@ -9,9 +9,9 @@ import sys
 from bodies import PLAIN
 
 import splatjax as sj
-from splatjax.cli import _view, main
+from splatjax.cli import _render, main
 
-_view.PictureOptions.settings = PLAIN
+_render.PictureOptions.settings = PLAIN
 write_png = sj.write_png
 
 

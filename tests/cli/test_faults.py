@@ -120,7 +120,7 @@ REFUSED = {
     "fit media.csv --all --output nowhere/fits.csv": ["no folder"],
     "fit media.csv --all --output fits.csv --count 9": ["--count is 9"],
     # Options that have no effect, or do not go together.
-    "fit media.csv --all --output fits.csv --error 0.1": ["leave the other options out"],
+    "fit media.csv --all --output fits.csv --error 0.1": ["--error is 0.1", "--all"],
     "fit dot.csv --model monte-carlo": ["--model", "dot.csv"],
     "fit dot.csv --power 2": ["--power", "dot.csv"],
     "fit dot.exr --mm-per-pixel 1 --single-scattering": ["--single-scattering", "dot.exr"],

@@ -16,7 +16,7 @@ from pictures import write_picture
 from PIL import Image
 
 import splatjax as sj
-from splatjax.cli import _fit, _models
+from splatjax.cli import _models
 
 pytestmark = pytest.mark.once
 
@@ -214,7 +214,7 @@ def test_a_table_of_media_becomes_a_table_of_fits_and_is_continued(
     output = tmp_path / "fits.csv"
     words = ["fit", media, "--all", "--count", 2, "--output", output]
     with monkeypatch.context() as patch:
-        patch.setattr(_fit, "read_columns", unittest.mock.Mock(side_effect=KeyboardInterrupt))
+        patch.setattr(sj.io, "read_columns", unittest.mock.Mock(side_effect=KeyboardInterrupt))
         assert run(*words) == 130
     capsys.readouterr()
     assert run(*words) == 0
