@@ -105,13 +105,13 @@ class Recover:
                     f"lie between 1 and {_LARGEST_ETA:g}: marble has 1.5, skin 1.4",
                 ),
                 "g": (abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
+                "start": (
+                    len(self.start) > 0,
+                    "name one or more materials (`splatjax materials` lists them)",
+                ),
             },
         )
         model_by_name(self.model, self.g)  # reports faults before the pictures are read
-        if not self.start:
-            raise ValueError(
-                "--start is empty; give one or more materials (`splatjax materials` lists them)"
-            )
         for name in self.start:
             sj.load_medium(name)
         with stage(f"reading {self.splats} and {self.pictures}"):

@@ -16,7 +16,7 @@ import tyro
 
 import splatjax as sj
 
-from ._scene import camera_of, draw, rough_picture, scene_contents
+from ._scene import camera_of, draw, identified, rough_picture, scene_contents
 from ._terminal import (
     Rules,
     check_folder,
@@ -105,9 +105,9 @@ class PictureOptions(ViewOptions):
             return versions
         options = {option_name(n): v for n, v in asdict(self).items() if n not in _NOT_IN_PICTURES}
         if self.environment and self.environment not in sj.io.ENVIRONMENTS:
-            options["--environment"] = _identified(Path(self.environment))
+            options["--environment"] = identified(Path(self.environment))
         return options | {
-            "splats": _identified(self.splats) if self.splats else "the built-in bust",
+            "splats": identified(self.splats) if self.splats else "the built-in bust",
             "contents of --material": sj.io.material_path(self.material).read_text("utf-8"),
             "precision": str(jnp.result_type(float)),
             **versions,
@@ -135,7 +135,6 @@ class Render(PictureOptions):
 
     #: The EXR file to write; the PNG file has the same name with another suffix.
     output: Path = Path("out.exr")
-
     #: Number of splats to read at a time, for files that are larger than memory. 0 reads all at
     #: once.
     stream: int = 0
@@ -266,10 +265,9 @@ class Turntable(PictureOptions):
                     "be a finite number other than 0",
                 ),
                 "fps": (0.1 <= self.fps <= 60, "lie between 0.1 and 60"),
+                "output": (not self.output.is_file(), "be a folder, or a new name"),
             }
         )
-        if self.output.exists() and not self.output.is_dir():
-            raise ValueError(f"{self.output}: is a file; give the name of a folder")
         check_folder(self.output)
         paths = [
             (self.output / f"frame_{i:04}.exr", self.output / f"frame_{i:04}.png")
@@ -330,7 +328,3 @@ class Turntable(PictureOptions):
             self.write(paths[i][0], frame, material, scenes[i].lights, cameras[i], settings)
 
         return make
-
-
-def _identified(path: Path) -> str:
-    return f"{path.name}, {sj.io.fingerprint(path)}"

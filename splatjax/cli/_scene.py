@@ -64,6 +64,11 @@ def scene_contents(
     return sj.io.plain_scene(body, material, camera, tables, settings, g)
 
 
+def identified(path: Path) -> str:
+    """Return the name of a file, and its fingerprint."""
+    return f"{path.name}, {sj.io.fingerprint(path)}"
+
+
 def draw(
     scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings, plan: sj.Plan, light=None
 ) -> sj.Frame:

@@ -134,11 +134,6 @@ def orbited(place: np.ndarray, turn: float, rise: float) -> np.ndarray:
     return np.asarray([place[1] + offset, place[1]])
 
 
-def zoomed(place: np.ndarray, log_factor: float) -> np.ndarray:
-    """Move a camera away from its target, by the logarithm of the factor."""
-    return np.asarray([place[1] + (place[0] - place[1]) * np.exp(log_factor), place[1]])
-
-
 def shifted(place: np.ndarray, across: float, down: float, fov: float) -> np.ndarray:
     """Move a camera and its target so that the picture shifts by fractions of its height.
 

@@ -1,6 +1,7 @@
 """The compiled programs that run while a slider moves."""
 
 from dataclasses import replace
+from functools import partial
 from typing import TypeAlias
 
 import equinox as eqx
@@ -50,16 +51,13 @@ def changes_with_coefficients(
     channel depends only on its own coefficients.
     """
 
-    def change(name: str) -> Float[Array, " channels"]:
-        def radiance(value):
-            gaussians = weights_of(model, replace(optics, **{name: value}), variances)
-            gaussians = gaussians if has_color else gaussians.white()
-            return jnp.sum(light_of_gaussians(basis, gaussians, place), axis=0)
+    def radiance(name: str, value: Array) -> Float[Array, " channels"]:
+        gaussians = weights_of(model, replace(optics, **{name: value}), variances)
+        gaussians = gaussians if has_color else gaussians.white()
+        return jnp.sum(light_of_gaussians(basis, gaussians, place), axis=0)
 
-        value = getattr(optics, name)
-        return jax.jvp(radiance, (value,), (value,))[1]
-
-    return [change(name) for name in names]
+    values = {name: getattr(optics, name) for name in names}
+    return [jax.jvp(partial(radiance, n), (value,), (value,))[1] for n, value in values.items()]
 
 
 @eqx.filter_jit

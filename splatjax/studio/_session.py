@@ -1,7 +1,7 @@
 """A scene that keeps intermediate results until something that they depend on changes."""
 
-import dataclasses
 from collections.abc import Hashable
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -110,9 +110,9 @@ class Session:
         self.fov = float(np.degrees(2 * np.arctan(0.5 / camera.focal_length)))
         few = jax.tree.map(lambda leaf: leaf[::_MERGED], scene.splats)
         radii, areas = _WIDER * _MERGED**0.5 * few.radii, _MERGED * few.areas
-        few = dataclasses.replace(few, radii=radii, areas=areas)
+        few = replace(few, radii=radii, areas=areas)
         even = tuple(
-            dataclasses.replace(light, directions=even_directions(_DIRECTIONS))
+            replace(light, directions=even_directions(_DIRECTIONS))
             if isinstance(light, EnvironmentLight) and light.directions is None
             else light
             for light in scene.lights
@@ -182,7 +182,7 @@ class Session:
         """
         optics, body = self.optics(controls), body or self._full
         has_medium = isinstance(optics, Medium) and controls.has_fitted_weights
-        material = dataclasses.replace(
+        material = replace(
             self.own.material,
             gaussians=self._gaussians(controls),
             angles=self._angles,
@@ -224,7 +224,7 @@ class Session:
         if own is None or controls.coefficients == self.start.coefficients:
             return own
         if self.skin is not None:
-            return dataclasses.replace(self.skin, eta=controls.eta, **dict(controls.skin))
+            return replace(self.skin, eta=controls.eta, **dict(controls.skin))
         rows = controls.sigma_a, controls.sigma_s_prime, [controls.eta] * len(controls.sigma_a)
         return Medium(*(jnp.asarray(row, self._variances.dtype) for row in rows))
 
@@ -266,9 +266,7 @@ class Session:
 
     def _keys(self, controls: Controls, body: Body) -> tuple[Hashable, Hashable]:
         """Return keys of the light on the splats, and of the view."""
-        state: Hashable = dataclasses.replace(
-            controls, eye=(), target=(), layer=LAYERS[0], exposure=0.0
-        )
+        state: Hashable = replace(controls, eye=(), target=(), layer=LAYERS[0], exposure=0.0)
         if body.is_blended:
             state = controls.turn, controls.light_stops, controls.eta, controls.roughness
         return (state, self._settled), (controls.eye, controls.target)
@@ -281,10 +279,10 @@ class Session:
             offset = np.subtract(start.eye, start.target)
             offsets = [d * rotation_about_y(t) @ offset for t in _QUARTERS for d in _DISTANCES]
             eyes = [plain(np.add(start.target, offset)) for offset in offsets]
-            states = [controls, *(dataclasses.replace(start, eye=eye) for eye in eyes)]
+            states = [controls, *(replace(start, eye=eye) for eye in eyes)]
             turns = [0.0] if body.is_in_environments else _QUARTERS
             return make_plan(
-                [dataclasses.replace(scene, lights=turned(scene.lights, turn)) for turn in turns],
+                [replace(scene, lights=turned(scene.lights, turn)) for turn in turns],
                 [self.camera(state, body) for state in states],
                 body.settings,
             )
@@ -303,7 +301,7 @@ class Session:
 
     def _basis(self, body: Body, controls: Controls) -> DiffusionBasis:
         def make() -> DiffusionBasis:
-            shiny = dataclasses.replace(controls, specular=1.0)
+            shiny = replace(controls, specular=1.0)
             basis = diffusion_basis(
                 self.scene(shiny, body),
                 self.camera(shiny, body),

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from splatjax._format import CHANNEL_COLORS
 
-from ._controls import LAYERS, Controls, orbited, shifted, zoomed
+from ._controls import LAYERS, Controls, orbited, shifted
 from ._saving import SUFFIXES
 from ._session import Session
 from ._sliders import coefficient_lines, sliders
@@ -156,7 +156,8 @@ class Widget(Viewer, ipywidgets.HBox):
         """Move the camera as the mouse is dragged, or choose the pixel that is clicked."""
         kind = event["type"]
         if kind == "wheel":
-            self._look(zoomed(self._place, event["dy"] / 500))
+            target = self._place[1]
+            self._look(target + (self._place - target) * np.exp(event["dy"] / 500))
         if not kind.startswith("pointer"):
             return
         at = event["x"], event["y"]

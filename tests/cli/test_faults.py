@@ -82,7 +82,7 @@ REFUSED = {
     "export skin --output o.json --mm-per-unit 9": ["--mm-per-unit is 9", "o.json", ".mtlx"],
     "export scene.toml --output o.usda --lux 9": ["--lux is 9", "o.usda", ".glb"],
     "turntable plate.ply --output none/turn": ["none/turn", "no folder"],
-    "turntable plate.ply --output picture.png": ["picture.png", "is a file"],
+    "turntable plate.ply --output picture.png": ["--output is picture.png", "a folder"],
     # Values that an option cannot have, before a file is read.
     "render missing.ply --elevation 90": ["--elevation", "90"],
     "render missing.ply --fov 180": ["--fov", "180"],
