@@ -24,9 +24,9 @@ def camera_of(source: str, mm_per_unit: float, up: str, height: int, scale: floa
     return replace(sj.io.resized(camera, height), position=camera.position * scale)
 
 
-def is_scene(path: Path | None) -> bool:
+def is_scene(path: Path) -> bool:
     """Return whether a file is, by its suffix, a scene, or a picture whose manifest is a scene."""
-    return path is not None and path.suffix.lower() in (".toml", ".exr")
+    return path.suffix.lower() in (".toml", ".exr")
 
 
 def scene_contents(

@@ -167,7 +167,7 @@ class ViewOptions:
         """Return the contents of the file that describes the whole scene, `None` without one."""
         if self.splats is None or not is_scene(self.splats):
             return None
-        reason = f"{self.splats} describes the whole scene, and may be changed"
+        reason = f"{self.splats} describes the whole scene (change it there)"
         check_unused(self, vars(self).keys() - _BESIDE_SCENES, reason)
         return sj.io.scene_table(self.splats)
 
@@ -236,15 +236,12 @@ class ViewOptions:
             return (sj.EnvironmentLight(self._environment.image, rotation),)
         # Under the first light, a white diffuser that faces it has radiance 1.
         irradiance = np.full(material.channels, np.pi)
-        towards = -direction_to(light_azimuth, elevation)
-        light = sj.DirectionalLight(direction=towards, irradiance=irradiance)
+        light = sj.DirectionalLight(-direction_to(light_azimuth, elevation), irradiance)
         side = math.copysign(_FILL_SIDE, math.remainder(self.azimuth - first_azimuth, 360))
         if not fill:
             return (light,)
-        towards = -direction_to(azimuth + side, _FILL_ELEVATION)
-        return light, sj.DirectionalLight(
-            direction=towards, irradiance=fill * irradiance, cast_shadows=False
-        )
+        beside = -direction_to(azimuth + side, _FILL_ELEVATION)
+        return light, sj.DirectionalLight(beside, fill * irradiance, cast_shadows=False)
 
     def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         """Place a camera at an azimuth so that the bounding sphere of the splats, given in parts,
