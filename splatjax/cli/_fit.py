@@ -24,6 +24,7 @@ from ._terminal import (
     check_unused,
     complete,
     note,
+    process_index_and_count,
     save_figure,
     stage,
 )
@@ -145,6 +146,7 @@ class Fit:
             )
 
         done = complete(
+            process_index_and_count(),
             path / "fits.json",
             {
                 "media": sj.io.fingerprint(self.medium),

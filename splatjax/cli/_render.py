@@ -26,6 +26,7 @@ from ._terminal import (
     note,
     option_name,
     preview,
+    process_index_and_count,
     stage,
 )
 from ._view import ViewOptions
@@ -254,6 +255,7 @@ class Turntable(PictureOptions):
     table = None  # a scene's file has one camera
 
     def run(self) -> None:
+        process = process_index_and_count()
         in_webp = f"be at most {_LARGEST} in turntable.webp"
         self.check(
             {
@@ -269,16 +271,13 @@ class Turntable(PictureOptions):
             }
         )
         check_folder(self.output)
-        paths = [
-            (self.output / f"frame_{i:04}.exr", self.output / f"frame_{i:04}.png")
-            for i in range(self.frames)
-        ]
+        files = [self.output / f"frame_{i:04}.exr" for i in range(self.frames)]
+        paths = [(file, file.with_suffix(".png")) for file in files]
+        material = sj.io.material_path(self.material)
         done = complete(
+            process,
             self.output / "turntable.json",
-            {
-                **self.manifest(),
-                "contents of --material": sj.io.fingerprint(sj.io.material_path(self.material)),
-            },
+            self.manifest() | {"contents of --material": sj.io.fingerprint(material)},
             paths,
             lambda: self._prepare(paths),
             name="frames",

@@ -151,6 +151,7 @@ _COUNTS = "JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"
 
 
 def complete(
+    process: tuple[int, int],
     record_path: Path,
     record: Mapping[str, Any],
     items: Sequence[tuple[Path, ...]],
@@ -164,6 +165,7 @@ def complete(
 
     **Arguments:**
 
+    - `process`: from `process_index_and_count`, called before any computation.
     - `record_path`: path of the record, in the folder of the files.
     - `record`: the settings on which the files depend.
     - `items`: the files of each item.
@@ -179,7 +181,7 @@ def complete(
     missing, folder = _missing(items), record_path.parent
     if len(missing) < len(items):
         note(f"{len(items) - len(missing)} of {len(items)} {name} exist already, and are kept")
-    index, processes = process_index_and_count()
+    index, processes = process
     share = missing[index::processes]
     if share:
         make = prepare()
