@@ -37,8 +37,7 @@ def read(path) -> dict[str, np.ndarray]:
 def test_the_coefficients_come_back(tmp_path, float64):
     """Absorbing, nearly white, and in between; lengths in another unit."""
     medium = Medium([2.0, 0.01, 1e-4], [0.5, 1.0, 2.0], 1.4)
-    gaussians = sj.SumOfGaussians([1.0], [[0.5] * 3])
-    material = sj.Material(gaussians, 1.4, 0.5, 0.25, medium=medium)
+    material = sj.Material(sj.SumOfGaussians([1.0], [[0.5] * 3]), 1.4, 0.5, 0.25, medium=medium)
     save_materialx(tmp_path / "it.mtlx", material, mm_per_unit=10.0)
     found = read(tmp_path / "it.mtlx")
     path = 10 * found["subsurface_radius"] * found["subsurface_radius_scale"]

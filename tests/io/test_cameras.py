@@ -99,10 +99,8 @@ def test_cameras_of_gltf_have_its_projection(double, suffix):
     ):
         near = np.asarray([[0.3, -0.2, -3.0], [-0.4, 0.1, -2.0]])
         world = np.asarray([0.1, 0.2, -0.3]) + rig.apply(2 * np.asarray(place) + turn.apply(near))
-        tangents = np.tan(yfov / 2) * np.asarray([aspect, 1])
-        device = near[:, :2] / tangents / -near[:, 2:]
-        size = np.asarray([512 * aspect, 512])
-        expected = (device * [1, -1] + 1) / 2 * size
+        device = near[:, :2] / (np.tan(yfov / 2) * np.asarray([aspect, 1])) / -near[:, 2:]
+        expected = (device * [1, -1] + 1) / 2 * np.asarray([512 * aspect, 512])
         np.testing.assert_allclose(pixels(camera, world), expected, atol=PIXELS, err_msg=name)
 
 

@@ -105,8 +105,7 @@ def test_shipped_weights_are_not_negative_and_sum_to_the_total_reflectance(name)
     elif isinstance(profile, Skin):
         profile = Projected(profile.profile(), spectrum_to_rgb(profile.wavelengths))
     assert np.all(material.gaussians.weights >= 0)
-    total = material.total_reflectance()
-    np.testing.assert_allclose(total, profile.total_reflectance(), atol=HELD)
+    np.testing.assert_allclose(material.total_reflectance(), profile.total_reflectance(), atol=HELD)
 
 
 @pytest.mark.once

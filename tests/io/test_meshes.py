@@ -209,8 +209,7 @@ def test_normals_end_at_hard_edges(tmp_path, body, kind, rounded):
 
 def test_splats_reach_little_beyond_hard_edges(tmp_path):
     """Seen up to 0.8 of their radius, at most 0.7 spacings; at corners too."""
-    path = export(HARD_BODIES["box"], tmp_path, "off")
-    splats = sj.sample_mesh(path, COUNT, mm_per_unit=1.0)
+    splats = sj.sample_mesh(export(HARD_BODIES["box"], tmp_path, "off"), COUNT, mm_per_unit=1.0)
     centers, normals = np.asarray(splats.centers), np.asarray(splats.normals)
     spacing = (HARD_BODIES["box"].area / COUNT) ** 0.5
     beyond = np.abs(centers) + 0.8 * np.asarray(splats.radii)[:, None] - [10, 12, 8]
@@ -276,8 +275,7 @@ def test_raw_points_are_completed_and_a_mesh_is_not_points(tmp_path):
     assert_refused(lambda: sj.read_splats(path), r"a\.ply: is a mesh.*splatjax sample")
     trimesh.PointCloud(ball.vertices).export(path)
     splats = sj.read_splats(path)
-    outward = np.asarray(splats.centers) / 20
-    assert (np.asarray(splats.normals) * outward).sum(axis=1).min() > 0.99
+    assert np.sum(splats.normals * splats.centers / 20, axis=1).min() > 0.99
     np.testing.assert_allclose(np.asarray(splats.areas).sum(), 4 * np.pi * 400, rtol=0.01)
     assert (np.asarray(splats.radii) > np.sqrt(np.asarray(splats.areas))).all()
 

@@ -56,8 +56,7 @@ def test_a_scene_comes_back_from_its_file_and_from_a_manifest(tmp_path):
     sj.write_exr(tmp_path / "a.exr", some_frame(), manifest=manifest)
     assert eqx.tree_equal(load_scene(tmp_path / "a.exr"), (scene, camera, SHAPE), **CLOSE)
     for diffuser in (sj.diffusion.ExitanceDiffuser(), sj.diffusion.ClusterDiffuser()):
-        settings = sj.RenderSettings(diffuser=diffuser)
-        save_scene(tmp_path / "b.toml", scene, camera, settings, g=0.25)
+        save_scene(tmp_path / "b.toml", scene, camera, sj.RenderSettings(diffuser=diffuser), g=0.25)
         assert load_scene(tmp_path / "b.toml")[2].diffuser == diffuser
     material = sj.io.material_of_scene(sj.io.scene_table(tmp_path / "b.toml"))
     assert sj.io.load_mean_cosine(material) == 0.25

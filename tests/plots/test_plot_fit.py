@@ -34,8 +34,7 @@ def test_a_perfect_fit_of_one_channel_and_the_energy_that_another_misses(dtype):
     less = sj.SumOfGaussians(gaussians.variances, 0.99 * gaussians.weights)
     perfect, misses = (plot_fit(gaussians, fit).axes for fit in (gaussians, less))
     assert np.nanmax(np.abs(perfect[2].lines[0].get_ydata())) == 0
-    label = misses[0].get_legend().get_texts()[0].get_text()
-    assert label.endswith("energy -1.00e-02")
+    assert misses[0].get_legend().get_texts()[0].get_text().endswith("energy -1.00e-02")
 
 
 def test_what_was_not_fitted_is_shaded_and_not_counted():
@@ -45,8 +44,7 @@ def test_what_was_not_fitted_is_shaded_and_not_counted():
     gaussians = sj.SumOfGaussians([0.5, 9.0], [0.2, 0.4])
     error = float(sj.fitting.relative_error(beam, gaussians, rule)[0])
     figure = plot_fit(beam, gaussians, rule=rule)
-    legend = figure.axes[0].get_legend().get_texts()[0].get_text()
-    assert f"E = {error:.2e}" in legend
+    assert f"E = {error:.2e}" in figure.axes[0].get_legend().get_texts()[0].get_text()
     for axes in figure.axes[1:]:
         (shade,) = [
             patch for patch in axes.patches if patch.get_facecolor()[:3] == (0.93, 0.93, 0.93)

@@ -218,8 +218,7 @@ def over_processes(what: str, index: str, count: str, port: str) -> dict:
     splats = jax.tree.map(lambda leaf: jax.device_put(leaf, cut), world.splats)
 
     def found(splats, mesh):
-        cut_scene = sj.Scene(splats, world.lights, world.material)
-        plan = sj.make_plan(cut_scene, eye, TILED, mesh=mesh)
+        plan = sj.make_plan(sj.Scene(splats, world.lights, world.material), eye, TILED, mesh=mesh)
 
         def draw(splats, plan):
             return sj.render(sj.Scene(splats, world.lights, world.material), eye, TILED, plan)

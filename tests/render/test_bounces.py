@@ -158,8 +158,7 @@ def test_a_picture_shows_light_that_was_kept_with_its_bounces():
     body, settings = cup(90), replace(PLAIN, bounces=1, kernel=sj.diffusion.PlainMean())
     scene = sj.Scene(body, SUN, MATTE)
     plan = sj.make_plan(scene, CAMERA, settings)
-    kept = sj.illuminate(scene, plan, settings)
-    frame = sj.render(scene, CAMERA, settings, plan, light=kept)
+    frame = sj.render(scene, CAMERA, settings, plan, light=sj.illuminate(scene, plan, settings))
     middle, strength = (slice(6, -6), slice(6, -6)), np.asarray([1.0, 2.0, 3.0])
     gained = (np.asarray(frame.irradiance) - strength * np.asarray(frame.normal)[..., 2:])[middle]
     exact = 0.5 * np.asarray(MATTE.total_reflectance()) * strength / 2

@@ -88,8 +88,7 @@ def test_an_environment_of_one_pixel_is_a_directional_light():
     lamp = sj.DirectionalLight(-toward, image[9, 40] * strip * np.pi / 32)
     ours, lamps = (render(light, BODY, GLOSSY) for light in (sj.EnvironmentLight(image), lamp))
     assert np.max(apart(ours.diffuse, lamps.diffuse)[""]) < 2e-3
-    ratio = np.sum(ours.specular) / np.sum(lamps.specular)
-    assert float(ratio) == pytest.approx(1, abs=0.05)
+    assert float(np.sum(ours.specular) / np.sum(lamps.specular)) == pytest.approx(1, abs=0.05)
     assert apart(ours.shadow, lamps.shadow)[""] < 5e-3
 
 
@@ -101,8 +100,7 @@ def test_an_environment_is_the_sum_of_its_samples_in_every_layer():
     material = sj.Material(
         two_gaussians(), eta=1.0, specular=0.0, single_scattering=sj.SingleScattering(medium)
     )
-    image = np.random.default_rng(1).uniform(size=(4, 8, 3)) ** 4
-    sky = sj.EnvironmentLight(image, count=6)
+    sky = sj.EnvironmentLight(np.random.default_rng(1).uniform(size=(4, 8, 3)) ** 4, count=6)
     lamps = [sj.DirectionalLight(each.direction, each.irradiance) for each in sky.samples()]
     camera = sj.Camera.look_at([0, -30, 30], [0, 0, 0], fov=14, width=24, height=24)
     ours, theirs = (
@@ -274,8 +272,7 @@ def test_maps_of_merged_splats_let_in_the_light_that_full_maps_do():
     for shadows in (sj.splatting.ShadowSettings(resolution=256), coarse):
         settings = dataclasses.replace(TILES, sample_shadows=shadows)
         entering.append(irradiance(scene, settings))
-    plan = sj.make_plan(scene, CAMERA, settings)
-    assert plan.shadows[0].splats_per_disc == 8
+    assert sj.make_plan(scene, CAMERA, settings).shadows[0].splats_per_disc == 8
     full, found = entering
     assert np.sqrt(np.mean((found - full) ** 2)) < 0.04 * np.mean(full)
     assert np.mean(found) == pytest.approx(np.mean(full), rel=0.02)

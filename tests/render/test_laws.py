@@ -45,8 +45,7 @@ def test_exitance_over_irradiance_is_the_total_reflectance_or_the_albedo(albedo)
     if albedo is not None:
         splats = with_albedo(splats, np.tile(albedo, (splats.count, 1)))
         gaussians, reflectance = two_gaussians().white(), albedo
-    material = sj.Material(gaussians, eta=1.0, specular=0.0)
-    scene = sj.Scene(splats, (lamp((np.pi,) * 3),), material)
+    scene = sj.Scene(splats, (lamp((np.pi,) * 3),), sj.Material(gaussians, eta=1.0, specular=0.0))
     radiance = np.asarray(sj.render(scene, camera_over(8.0, 32), PLAIN).beauty)[8:-8, 8:-8]
     np.testing.assert_allclose(
         radiance, np.broadcast_to(reflectance, radiance.shape), rtol=EXITANCE_TOLERANCE
@@ -220,8 +219,7 @@ def with_single_scattering(eta=1.3):
 
 def picture(with_single_scattering):
     splats = sheet(3.0, 0.2)
-    colors = jnp.broadcast_to(jnp.asarray(COLORS, float), splats.centers.shape)
-    splats = with_albedo(splats, colors)
+    splats = with_albedo(splats, jnp.broadcast_to(jnp.asarray(COLORS, float), splats.centers.shape))
     light = sj.DirectionalLight([0.6, 0.0, -0.8], [1.0, 2.0, 3.0], cast_shadows=False)
     camera = sj.Camera.look_at([0, 3, 4], [0, 0, 0], fov=2, width=4, height=4)
     return sj.render(sj.Scene(splats, (light,), with_single_scattering), camera, PLAIN)
@@ -259,8 +257,7 @@ def test_no_more_leaves_than_came_however_the_light_grazes(eta):
     """
     mu = jnp.asarray([1.0, 0.5, 0.2, 0.05, 0.0])
     for absorbing in (0.0, 0.002, 0.1):
-        medium = sj.Medium([absorbing], [1 - absorbing], eta)
-        single = sj.SingleScattering(medium)
+        single = sj.SingleScattering(sj.Medium([absorbing], [1 - absorbing], eta))
         rest = (0.95 if absorbing else 1.0) * (1 - single.total_reflectance())
         lit = sj.Material(sj.SumOfGaussians([1.0], rest[None]), single_scattering=single)
         for each in (lit, lit.white()):

@@ -71,8 +71,7 @@ def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp
     """Of a small picture of the page's own, whose error bars are 5 to 14%."""
     session = page._session
     start = session.start
-    darker = tuple(1.5 * number for number in start.sigma_a)
-    dark = dataclasses.replace(start, sigma_a=darker)
+    dark = dataclasses.replace(start, sigma_a=tuple(1.5 * number for number in start.sigma_a))
     session.picture(dark)  # whose variances and angles are then those of the coefficients
     target = session.frame(dark).beauty
     camera, lights = session.camera(start), session.own.lights
@@ -87,8 +86,7 @@ def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp
     powers = [searching._handles[f"sigma_a {channel}"].value for channel in (1, 2, 3)]
     np.testing.assert_allclose(powers, np.log2(1.5), atol=0.06)
     wait_until(lambda: searching._status.content == "")
-    difference = searching._compared.image[:, SIDE:].astype(int) - 128
-    assert np.abs(difference).max() <= 1
+    assert np.abs(searching._compared.image[:, SIDE:].astype(int) - 128).max() <= 1
     searching.close()
 
 

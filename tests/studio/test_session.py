@@ -265,10 +265,8 @@ def test_what_is_saved_makes_the_picture_again(studio, states, tmp_path, monkeyp
         np.asarray(Image.open(path), int) for path in (paths[0], paths[-1].with_suffix(".png"))
     )
     assert np.abs(first - again).max() <= SAME
-    frame = sj.read_exr(paths[1])
-    assert np.abs(shown(frame, controls) - first).max() <= SAME
-    material = sj.load_material(paths[2])
-    assert eqx.tree_equal(material, sj.io.load_scene(paths[3])[0].material)
+    assert np.abs(shown(sj.read_exr(paths[1]), controls) - first).max() <= SAME
+    assert eqx.tree_equal(sj.load_material(paths[2]), sj.io.load_scene(paths[3])[0].material)
 
 
 def test_lights_turn_about_the_vertical_axis():

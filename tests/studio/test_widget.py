@@ -18,8 +18,7 @@ EVENT = {"buttons": (1,), "type": "pointer_move"}
 
 @pytest.fixture
 def shown(studio, tmp_path):
-    session = Session(studio.own, studio.camera(studio.start), [0, 0, 0])
-    return widget(session, tmp_path / "saved")
+    return widget(Session(studio.own, studio.camera(studio.start), [0, 0, 0]), tmp_path / "saved")
 
 
 def parts(box) -> list:
@@ -55,8 +54,7 @@ def drawn(box) -> list[np.ndarray]:
 
 def test_a_widget_shows_the_picture_of_its_controls(shown, studio):
     assert shown.controls == studio.start
-    first = next(s for s in parts(shown) if getattr(s, "description", "") == "all")
-    first.value = 1.0
+    next(s for s in parts(shown) if getattr(s, "description", "") == "all").value = 1.0
     found(shown, ipywidgets.FloatSlider, "exposure, stops").value = 0.5
     doubled = tuple(2 * number for number in studio.start.sigma_a)
     assert shown.controls == dataclasses.replace(studio.start, sigma_a=doubled, exposure=0.5)
