@@ -1,20 +1,27 @@
-"""Cameras and lights of files that other programs wrote: pycolmap 4.2.1 and pygltflib 1.16.5
-(tests/io/cameras). Cameras show points where those programs do.
+"""Scenes as TOML files and manifests of pictures; cameras and lights of files that other programs
+wrote: pycolmap 4.2.1 and pygltflib 1.16.5 (tests/io/cameras). Cameras show points where those
+programs do.
 """
 
 import json
 import shutil
+import tomllib
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import unit
+import trimesh
+from bodies import assert_refused, unit
 from scipy.spatial.transform import Rotation
 from test_refusals import refused, write_any
+from writers import some_frame, some_splats
 
-from splatjax.io import load_cameras, load_lights
+import splatjax as sj
+from splatjax.io import load_cameras, load_lights, load_scene, save_scene
 from splatjax.splatting import PerspectiveView
 
 FILES = Path(__file__).parent / "cameras"
@@ -41,6 +48,8 @@ def pixels(camera, points, mm=MM):
 
 
 in_mm = partial(load_cameras, mm_per_unit=1.0)
+TRANSFORMS = """{"w": 640, "h": 480.0, "fl_x": 600.5, "fl_y": 600.5, "cx": 310.25, "cy": 251.5,
+"k1": 0.0, "p2": 0, "is_fisheye": false, "aabb_scale": 4}"""
 
 
 @pytest.fixture
@@ -51,15 +60,12 @@ def transforms(tmp_path):
     camera = load_cameras(FILES / "colmap", mm_per_unit=1.0)["left 1.png"]
     pose = np.eye(4)
     pose[:3] = np.column_stack([np.asarray(camera.rotation).T * [1, -1, -1], camera.position])
-    content = {"w": 640, "h": 480.0, "fl_x": 600.5, "fl_y": 600.5, "cx": 310.25, "cy": 251.5}
-    content |= {"k1": 0.0, "p2": 0, "is_fisheye": False, "aabb_scale": 4}
+    content = json.loads(TRANSFORMS)
     content["frames"] = [{"file_path": "left 1.png", "transform_matrix": pose.tolist()}]
 
     def write(removed="", **changes):
-        text = json.dumps(
-            {n: v for n, v in (content | changes).items() if n not in removed.split()}
-        )
-        return write_any(tmp_path / "transforms.json", text)
+        kept = {n: v for n, v in (content | changes).items() if n not in removed.split()}
+        return write_any(tmp_path / "transforms.json", json.dumps(kept))
 
     return write
 
@@ -86,19 +92,25 @@ def test_cameras_of_nerf_have_the_axes_of_opengl(double, transforms):
     np.testing.assert_allclose(pixels(camera, POINTS), expected, atol=PIXELS)
 
 
+RIG = Rotation.from_rotvec([0, np.pi / 4, 0])
+
+
+def to_world(points):
+    return np.asarray([0.1, 0.2, -0.3]) + RIG.apply(points)
+
+
 @pytest.mark.parametrize("suffix", ["gltf", "glb"])
 def test_cameras_of_gltf_have_its_projection(double, suffix):
     """Against the projection matrix of the specification, with the matrices of the nodes."""
     with pytest.warns(UserWarning, match="'plan' is orthographic"):
         cameras = load_cameras(FILES / f"stage.{suffix}", mm_per_unit=MM)
-    rig = Rotation.from_rotvec([0, np.pi / 4, 0])
     left, right = Rotation.from_quat([1, 2, 3, 4]), Rotation.from_rotvec([0, np.pi / 2, 0])
     lenses = {"left": ([0.5, 0, 2], left, 0.7, 1.5), "right": ([1.5, 0.25, 0.5], right, 0.9, 1)}
+    near = np.asarray([[0.3, -0.2, -3.0], [-0.4, 0.1, -2.0]])
     for (name, camera), (place, turn, yfov, aspect) in zip(
         cameras.items(), lenses.values(), strict=True
     ):
-        near = np.asarray([[0.3, -0.2, -3.0], [-0.4, 0.1, -2.0]])
-        world = np.asarray([0.1, 0.2, -0.3]) + rig.apply(2 * np.asarray(place) + turn.apply(near))
+        world = to_world(2 * np.asarray(place) + turn.apply(near))
         device = near[:, :2] / (np.tan(yfov / 2) * np.asarray([aspect, 1])) / -near[:, 2:]
         expected = (device * [1, -1] + 1) / 2 * np.asarray([512 * aspect, 512])
         np.testing.assert_allclose(pixels(camera, world), expected, atol=PIXELS, err_msg=name)
@@ -109,11 +121,10 @@ def test_lights_of_gltf_keep_what_a_surface_receives(double):
     sun, bulb, spot = load_lights(FILES / "stage.gltf", mm_per_unit=MM, lux=0.5)
     np.testing.assert_allclose(sun.irradiance, [1.5, 0.75, 0.375])
     np.testing.assert_allclose(unit(sun.direction), [0, 1, 0], atol=1e-9)
-    place = np.asarray([0.1, 0.2, -0.3]) + Rotation.from_rotvec([0, np.pi / 4, 0]).apply([2, 4, 6])
-    np.testing.assert_allclose(bulb.position, MM * place)
+    np.testing.assert_allclose(bulb.position, MM * to_world([2, 4, 6]))
     _, received = bulb.incidence(bulb.position + jnp.asarray([0, -MM, 0]))
     np.testing.assert_allclose(received, [10, 9, 8])
-    axis = Rotation.from_rotvec([0, np.pi / 4, 0]).apply([0, 0, -1])
+    axis = RIG.apply([0, 0, -1])
     np.testing.assert_allclose(unit(spot.direction), axis, atol=1e-9)
     np.testing.assert_allclose([spot.inner_angle, spot.outer_angle], [0, np.degrees(0.5)])
     _, received = spot.incidence(spot.position[None] + MM * jnp.asarray([axis, -axis]))
@@ -148,30 +159,174 @@ def test_cameras_that_cannot_be_ours(transforms, changes, value):
     ("name", "text", "value"),
     [
         ("cameras.txt", FOV, "not a file of cameras"),
-        ("none.json", None, "no such file"),
         ("circle.gltf", '{"nodes": [{"children": [0]}], "scenes": [{"nodes": [0]}]}', "Recursion"),
         ("empty.gltf", '{"scenes": [{}]}', "export it with its cameras"),
     ],
 )
 def test_files_without_cameras(tmp_path, name, text, value):
-    path = tmp_path / name
-    if text:
-        write_any(path, text)
-    refused(path, value, in_mm, (ValueError, OSError))
+    refused(write_any(tmp_path / name, text), value, in_mm)
+    refused(tmp_path / "none.json", "no such file", in_mm, OSError)
 
 
-def test_a_lens_of_colmap_with_distortion(tmp_path):
-    shutil.copy(FILES / "colmap" / "images.txt", tmp_path)
-    refused(write_any(tmp_path / "cameras.txt", FOV), "FOV", lambda path: in_mm(path.parent))
-    folder = shutil.copytree(FILES / "colmap_binary", tmp_path / "binary")
-    data = bytearray((folder / "cameras.bin").read_bytes())
-    data[12] = 5  # OPENCV_FISHEYE
-    (folder / "cameras.bin").write_bytes(data)
-    refused(folder / "cameras.bin", "model 5", lambda path: in_mm(path.parent))
+@pytest.mark.parametrize(
+    ("folder", "name", "change", "value"),
+    [
+        ("colmap", "cameras.txt", lambda data: FOV.encode(), "FOV"),
+        # OPENCV_FISHEYE
+        ("colmap_binary", "cameras.bin", lambda data: data[:12] + b"\5" + data[13:], "model 5"),
+        ("colmap_binary", "cameras.bin", lambda data: data[:-5], "truncated"),
+        ("colmap_binary", "images.bin", lambda data: data[:-5], "truncated"),
+    ],
+)
+def test_files_of_colmap_with_distortion_or_cut_short(tmp_path, folder, name, change, value):
+    path = shutil.copytree(FILES / folder, tmp_path / folder) / name
+    path.write_bytes(change(path.read_bytes()))
+    refused(path, value, lambda path: in_mm(path.parent))
 
 
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
-def test_a_truncated_file_of_colmap(tmp_path, name):
-    folder = shutil.copytree(FILES / "colmap_binary", tmp_path / "binary")
-    (folder / name).write_bytes((folder / name).read_bytes()[:-5])
-    refused(folder, "truncated", in_mm)
+CAMERA = sj.Camera.look_at([0, 0, 90], [0, 1, 0], fov=30, width=20, height=16)
+CLOSE = {"rtol": 1e-6, "atol": 1e-7}
+SHAPE = sj.RenderSettings(bounces=1, diffuser=sj.diffusion.ShapeDiffuser())
+BY_HAND = """material = "marble"
+[splats]
+mesh = "body/box.stl"
+count = 60
+mm_per_unit = 10
+up = "z"
+[camera]
+file = "cameras/colmap"
+name = "left 1.png"
+mm_per_unit = 2
+height = 240
+[[lights]]
+kind = "environment"
+image = "overcast"
+rotation = 20
+"""
+
+
+def test_a_scene_comes_back_from_its_file_and_from_a_manifest(tmp_path):
+    """With every light; in single precision for splats and environments."""
+    lights = (
+        sj.DirectionalLight([1, -1, 0], [3, 2, 1], cast_shadows=False),
+        sj.PointLight([50, 60, 70], [1e4, 2e4, 3e4]),
+        sj.scene.SpotLight([50, 60, 70], [0, 0, -1], [1e4, 2e4, 3e4], 10, 25),
+        sj.GaussianBeam([0, 0, 90], [0, 0, -1], [5, 6, 7], 4.0),
+        sj.scene.RectangleLight([90, 0, 0], [1, 2, 3], [[0, 9, 0], [0, 0, 9]], count=7),
+        sj.scene.DiskLight([90, 0, 0], [1, 2, 3], [-1, 0, 0], 5.0),
+        sj.scene.SphereLight([90, 0, 0], [1, 2, 3], 5.0),
+        *(
+            sj.EnvironmentLight(
+                np.random.default_rng(0).uniform(size=(4, 8, 3)), 30, [1, 2, 3], directions=given
+            )
+            for given in (None, sj.scene.even_directions(5))
+        ),
+    )
+    scene = sj.Scene(some_splats(), lights, sj.load_material("marble"))
+    camera = replace(CAMERA, principal_point=[0.4, 0.6], near=0.5)
+    save_scene(tmp_path / "a.toml", scene, camera, SHAPE)
+    manifest = {"scene": tomllib.loads((tmp_path / "a.toml").read_text())}
+    sj.write_exr(tmp_path / "a.exr", some_frame(), manifest=manifest)
+    for path in (tmp_path / "a.toml", tmp_path / "a.exr"):
+        assert eqx.tree_equal(load_scene(path), (scene, camera, SHAPE), **CLOSE)
+    for diffuser in (sj.diffusion.ExitanceDiffuser(), sj.diffusion.ClusterDiffuser()):
+        save_scene(tmp_path / "b.toml", scene, camera, sj.RenderSettings(diffuser=diffuser), g=0.25)
+        assert load_scene(tmp_path / "b.toml")[2].diffuser == diffuser
+    material = sj.io.material_of_scene(sj.io.scene_table(tmp_path / "b.toml"))
+    assert sj.io.load_mean_cosine(material) == 0.25
+    plain = replace(SHAPE, kernel=sj.diffusion.PlainMean())
+    write = partial(save_scene, tmp_path / "a.toml")
+    assert_refused(partial(write, scene, camera, plain), r"a\.toml: stores only bounces")
+    harmonic = replace(scene, lights=sj.scene.HarmonicLight(np.zeros((9, 3))))
+    assert_refused(partial(write, harmonic, camera), "cannot store a HarmonicLight")
+
+
+@pytest.fixture
+def by_hand(tmp_path):
+    (tmp_path / "body").mkdir()
+    (tmp_path / "cameras").symlink_to(FILES)
+    trimesh.creation.box((1, 1, 9)).export(tmp_path / "body" / "box.stl")
+    return write_any(tmp_path / "a.toml", BY_HAND)
+
+
+def test_a_scene_by_hand_names_files_beside_it(by_hand):
+    scene, camera, settings = load_scene(by_hand)
+    assert scene.splats.count == 60
+    assert np.ptp(np.asarray(scene.splats.centers), axis=0).argmax() == 1
+    sky = sj.EnvironmentLight(sj.scene.overcast_sky(), 20, [1, 1, 1])
+    expected = sj.load_material("marble"), (sky,), sj.RenderSettings()
+    assert eqx.tree_equal((scene.material, scene.lights, settings), expected)
+    expected = load_cameras(by_hand.with_name("cameras") / "colmap", mm_per_unit=2.0)["left 1.png"]
+    assert eqx.tree_equal(camera, replace(expected, width=320, height=240), **CLOSE)
+
+
+AIMED = """[[lights]]
+kind = "rectangle"
+center = [-60, 50, 60]
+target = [0, 5, 0]
+width = 30
+height = 40
+radiance = 2
+[[lights]]
+kind = "disk"
+center = [1, 2, 3]
+target = [0, 5, 0]
+radius = 4
+radiance = 3
+[[lights]]
+kind = "spot"
+position = [1, 2, 3]
+target = [0, 5, 0]
+intensity = 3
+[[lights]]
+kind = "environment"
+image = "overcast"
+directions = 9
+"""
+
+
+def test_lights_may_face_a_target(by_hand, tmp_path):
+    before, _ = BY_HAND.split("[[lights]]")
+    scene, *others = load_scene(write_any(by_hand, before + AIMED))
+    facing = sj.scene.RectangleLight.facing
+    assert eqx.tree_equal(
+        scene.lights,
+        (
+            facing([-60, 50, 60], [0, 5, 0], 30, 40, [2, 2, 2]),
+            sj.scene.DiskLight([1, 2, 3], [3, 3, 3], [-1, 3, -3], 4),
+            sj.scene.SpotLight([1, 2, 3], [-1, 3, -3], [3, 3, 3]),
+            sj.EnvironmentLight(
+                sj.scene.overcast_sky(),
+                0,
+                [1, 1, 1],
+                directions=sj.scene.even_directions(9),
+            ),
+        ),
+    )
+    save_scene(tmp_path / "saved.toml", scene, *others)
+    assert "directions = 9\n" in (tmp_path / "saved.toml").read_text()
+    path = write_any(by_hand, before + AIMED.replace("radius", "direction = [0, 0, 1]\nradius"))
+    refused(path, "unknown entry 'direction'", load_scene)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "value"),
+    [
+        ('"marble"', '"marbel"', "'marble'"),
+        ('"marble"', "5", "[material] must be a table"),
+        ("mesh", "meshes", "[splats] has an unknown entry 'meshes'"),
+        ('"body/box.stl"', "5", "[splats] mesh must be a name in quotes; it is 5"),
+        ("box.stl", "none.stl", "none.stl"),
+        ("mm_per_unit = 10", "", "[splats] mm_per_unit"),
+        ("count = 60", "count = 60\nscale = true", "[splats] scale"),
+        ('"left 1.png"', '"7"', "has no camera '7'; give one of its 3 names"),
+        ('file = "cameras/colmap"\nname', "position = [0, 0, 9]\nname", "[camera] rotation"),
+        ('"overcast"', '"fog.exr"', "fog.exr"),
+        ("[[lights]]", "[settings]\nbounces = -1\n[[lights]]", "[settings]"),
+        ("[[lights]]", '[settings]\ndiffusion = "dipole"\n[[lights]]', "diffusion must be"),
+        ("[[lights]]", "[lights]", "lights must be one table or more"),
+    ],
+)
+def test_scenes_with_a_fault(by_hand, before, after, value):
+    path = write_any(by_hand, BY_HAND.replace(before, after))
+    refused(path, value, load_scene, (ValueError, OSError))
