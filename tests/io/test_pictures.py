@@ -14,6 +14,7 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 import trimesh
+from bodies import assert_refused
 from pictures import write_picture
 from PIL import Image
 from writers import SQUARE, TRIANGLES, UVS, ramp, some_frame, square, write_ply, xyz
@@ -49,8 +50,7 @@ def test_other_readers_rebuild_diffuse_from_layers_and_header_alone(tmp_path):
     with OpenEXR.File(str(path)) as file:
         header = dict(file.header())
         planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    weights = [header[f"splatjax.weights.{k}"] for k in (1, 2, 3, 4)]
-    rebuilt = sum(weights[k - 1] * planes[f"diffusion{k}"] for k in (1, 2, 3, 4))
+    rebuilt = sum(header[f"splatjax.weights.{k}"] * planes[f"diffusion{k}"] for k in (1, 2, 3, 4))
     np.testing.assert_allclose(rebuilt, planes["diffuse"], rtol=1e-6)
     np.testing.assert_allclose(header["splatjax.variances"], variances, rtol=1e-7)
     np.testing.assert_allclose(np.ravel(header["chromaticities"])[:2], [0.64, 0.33], rtol=1e-6)
@@ -61,8 +61,8 @@ def test_other_readers_rebuild_diffuse_from_layers_and_header_alone(tmp_path):
     # Nuke and Blender read `layer.channel`, and Blender only the channels R, G, B, A, X, Y, Z.
     assert all(re.fullmatch(r"(\w+\.)?[RGBAXYZ]", name) for name in names)
     layers = Counter(name.rpartition(".")[0] for name in names)
-    assert layers["diffusion4"] == layers["diffuse"] == 3
-    assert layers["shadow1"] == layers["shadow2"] == 1
+    counts = {"diffusion4": 3, "diffuse": 3, "shadow1": 1, "shadow2": 1}
+    assert counts.items() <= layers.items()
 
 
 def test_half_precision_but_for_lengths(tmp_path):
@@ -125,8 +125,8 @@ def test_a_notebook_shows_a_frame_as_png_writes_it(tmp_path):
     frame, spectral = some_frame(), some_frame(channels=12)
     write_png(tmp_path / "a.png", frame)
     assert frame._repr_png_() == (tmp_path / "a.png").read_bytes()
-    assert spectral._repr_png_() is None
-    assert jax.tree.map(lambda leaf: leaf[None], frame)._repr_png_() is None
+    for other in (spectral, jax.tree.map(lambda leaf: leaf[None], frame)):
+        assert other._repr_png_() is None
 
 
 def test_animation_keeps_the_colors_and_the_time(tmp_path):
@@ -136,14 +136,12 @@ def test_animation_keeps_the_colors_and_the_time(tmp_path):
     for path, picture in zip(frames, pictures, strict=True):
         Image.fromarray(picture).save(path)
     write_animation(tmp_path / "film.webp", frames, frames_per_second=24.0)
-    durations = []
     with Image.open(tmp_path / "film.webp") as film:
         assert (film.n_frames, film.size, film.info["loop"]) == (3, (5, 6), 0)
-        for i, picture in enumerate(pictures):
+        for i, duration in enumerate((42, 41, 42)):
             film.seek(i)
-            np.testing.assert_array_equal(np.asarray(film.convert("RGB")), picture)
-            durations.append(film.info["duration"])
-    assert durations == [42, 41, 42]
+            np.testing.assert_array_equal(np.asarray(film.convert("RGB")), pictures[i])
+            assert film.info["duration"] == duration
 
 
 SINGLE = 1e-6
@@ -173,8 +171,7 @@ def test_pictures_of_every_kind_of_number(tmp_path, suffix, kind, levels, channe
     if levels is None:
         np.testing.assert_array_equal(read_picture(path), shares[..., : 3 if channels > 1 else 1])
     else:
-        with pytest.raises(ValueError, match=rf"a\.{suffix}: is encoded for a display"):
-            read_picture(path)
+        assert_refused(lambda: read_picture(path), rf"a\.{suffix}: is encoded for a display")
 
 
 def test_decoding_is_that_of_colour_science():
@@ -195,20 +192,22 @@ def test_decoding_is_that_of_colour_science():
 def folder(tmp_path):
     """The square with and without its texture, in formats that have v up and down."""
     ramp().save(tmp_path / "ramp.png")
-    plain, texture = trimesh.visual.material.PBRMaterial(), ["TextureFile ramp.png"]
-    careless = square(material=plain)
+    material = trimesh.visual.material.PBRMaterial
+    plain, careless = square(material=material()), square(material=material())
     careless.visual.uv = careless.visual.uv * [1, -1] + [0, 1]
-    careless.export(tmp_path / "careless.glb")
-    square(material=plain).export(tmp_path / "square.glb")
-    square(material=plain).export(tmp_path / "square.obj", include_texture=True)
-    textured = square(material=trimesh.visual.material.PBRMaterial(baseColorTexture=ramp()))
-    textured.export(tmp_path / "textured.glb")
-    square(image=ramp()).export(tmp_path / "textured.obj", mtl_name="textured.mtl")
+    for name, mesh, options in (
+        ("careless.glb", careless, {}),
+        ("square.glb", plain, {}),
+        ("square.obj", plain, {"include_texture": True}),
+        ("textured.glb", square(material=material(baseColorTexture=ramp())), {}),
+        ("textured.obj", square(image=ramp()), {"mtl_name": "textured.mtl"}),
+    ):
+        mesh.export(tmp_path / name, **options)
     columns = xyz(SQUARE) | dict(zip("st", UVS.astype("f4").T, strict=True))
-    lists = {"vertex_index": TRIANGLES.astype("i4")}
-    write_ply(tmp_path / "textured.ply", columns, lists, comments=texture)
-    lists["texcoord"] = UVS[TRIANGLES].reshape(2, 6).astype("f4")
-    write_ply(tmp_path / "wedges.ply", xyz(SQUARE), lists, comments=texture)
+    faces = {"vertex_index": TRIANGLES.astype("i4")}
+    wedges = faces | {"texcoord": UVS[TRIANGLES].reshape(2, 6).astype("f4")}
+    for name, points, lists in (("textured", columns, faces), ("wedges", xyz(SQUARE), wedges)):
+        write_ply(tmp_path / f"{name}.ply", points, lists, comments=["TextureFile ramp.png"])
     return tmp_path
 
 
@@ -245,10 +244,8 @@ def test_specular_and_normal_maps(folder):
     Image.fromarray(np.full((4, 4), 51, np.uint8)).save(folder / "specular.png")
     tilted = 255 * (np.asarray([0.6, 0.0, 0.8]) * 0.5 + 0.5) * np.ones((4, 4, 1))
     Image.fromarray(np.rint(tilted).astype(np.uint8)).save(folder / "normal.png")
-    maps = {"specular": folder / "specular.png", "normal": folder / "normal.png"}
+    maps = {name: folder / f"{name}.png" for name in ("specular", "normal")}
     splats = sample_mesh(folder / "square.obj", 50, mm_per_unit=1.0, **maps)
     assert splats.albedo is None
-    np.testing.assert_allclose(np.asarray(splats.specular), 0.2, rtol=1e-6)
-    np.testing.assert_allclose(
-        np.asarray(splats.normals), np.tile([0.6, 0, 0.8], (50, 1)), atol=2 / 255
-    )
+    np.testing.assert_allclose(splats.specular, 0.2, rtol=1e-6)
+    np.testing.assert_allclose(splats.normals, np.tile([0.6, 0, 0.8], (50, 1)), atol=2 / 255)
