@@ -91,7 +91,6 @@ def test_sample_covers_a_mesh_that_may_have_z_up(tmp_path, capsys):
 
 
 @pytest.mark.long
-@pytest.mark.once
 def test_materials_draws_all_of_them_on_one_sheet(monkeypatch, tmp_path):
     """Ketchup is red and milk white; the other six places stay white."""
     monkeypatch.setattr(sj, "list_materials", lambda: ("ketchup", "wholemilk"))
@@ -104,7 +103,6 @@ def test_materials_draws_all_of_them_on_one_sheet(monkeypatch, tmp_path):
     assert min(place.min() for place in places[2:]) == 255
 
 
-@pytest.mark.once
 def test_sample_reads_the_share_of_another_material_from_a_map(tmp_path):
     """Skin that is dark where the map is white, on the right half of a square."""
     mesh, output, spots = tmp_path / "a.obj", tmp_path / "a.ply", tmp_path / "spots.png"
@@ -122,7 +120,6 @@ def test_sample_reads_the_share_of_another_material_from_a_map(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.once
 def test_render_shows_the_bust_and_its_manifest_makes_the_same_picture(plain, tmp_path, capsys):
     output, picture = tmp_path / "bust.exr", tmp_path / "bust.png"
     assert run("render", *SMALL, "--output", output) == 0
@@ -164,7 +161,6 @@ def test_a_material_of_one_channel_has_three(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.once
 @pytest.mark.long
 def test_render_without_scattering_is_lambertian(tmp_path):
     splats, output = plate(tmp_path / "plate.ply"), tmp_path / "plate.exr"

@@ -18,8 +18,6 @@ from PIL import Image
 import splatjax as sj
 from splatjax.cli import _models
 
-pytestmark = pytest.mark.once
-
 SKIN = [0.4395, 0.2133, 0.1155]  # what leaves skin1, by Monte Carlo (MCML)
 OWN = """[medium]
 unit = "1/mm"

@@ -38,7 +38,6 @@ def console(monkeypatch):
     return put
 
 
-@pytest.mark.once
 def test_a_preview_is_shown_while_the_picture_compiles_and_only_then(plain, console, tmp_path):
     splats, output, size = ball(tmp_path / "ball.ply"), tmp_path / "ball.exr", ("--width", 16)
     options = [*size, "--height", 24, "--material", "marble", "--no-scattering", "--output", output]

@@ -21,7 +21,7 @@ from splatjax.cli import _render
 from splatjax.cli._render import Turntable
 from splatjax.cli._terminal import process_index_and_count
 
-pytestmark = [pytest.mark.once, pytest.mark.usefixtures("plain")]
+pytestmark = pytest.mark.usefixtures("plain")
 
 FRAMES = 4
 

@@ -148,7 +148,6 @@ def _small_scene(entry: re.Match[str]) -> str:
 
 
 @pytest.mark.long
-@pytest.mark.once
 @pytest.mark.parametrize(
     "page",
     [
@@ -191,7 +190,6 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
 MATERIALS = (ROOT / "docs" / "materials.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.once
 @pytest.mark.parametrize(
     ("heading", "record"),
     [("Surface", sj.Material), ("Pigments of skin", sj.scattering.Skin)],
@@ -297,7 +295,6 @@ def test_what_programs_name_is_there(page):
 
 
 @pytest.mark.slow
-@pytest.mark.once
 def test_the_first_program_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sj.cache, "keep", lambda: None)
@@ -307,7 +304,6 @@ def test_the_first_program_of_the_readme_runs(tmp_path, monkeypatch):
 
 
 @pytest.mark.long
-@pytest.mark.once
 @pytest.mark.parametrize("page", WITH_PROGRAMS)
 def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -5,8 +5,6 @@ import tokenize
 import tomllib
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 WORDS = tomllib.loads((Path(__file__).parent / "glossary.toml").read_text(encoding="utf-8"))
 PHRASES = re.compile(rf"\b({'|'.join(WORDS['prose'])})\b".replace(" ", r"\s+"), re.IGNORECASE)
@@ -36,7 +34,6 @@ def in_code(path: Path) -> list[tuple[int, str, str]]:
     return faults
 
 
-@pytest.mark.once
 def test_words_that_were_replaced_do_not_come_back():
     faults = {path: in_code(path) for name in FOLDERS for path in (ROOT / name).rglob("*.py")}
     pages = [*MORE, *(path for name in FOLDERS for path in (ROOT / name).rglob("*.md"))]

@@ -108,7 +108,6 @@ def test_shipped_weights_are_not_negative_and_sum_to_the_total_reflectance(name)
     np.testing.assert_allclose(material.total_reflectance(), profile.total_reflectance(), atol=HELD)
 
 
-@pytest.mark.once
 @pytest.mark.slow
 @pytest.mark.parametrize("names", [["marble"], pytest.param(FITTED, marks=pytest.mark.long)])
 def test_shipped_files_are_what_the_command_writes(names, tmp_path):

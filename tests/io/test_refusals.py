@@ -359,7 +359,6 @@ def small_files(monkeypatch):
     resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-@pytest.mark.once
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_full_disk_leaves_what_stood_there_and_no_litter(tmp_path, name, small_files):
     target = tmp_path / name
@@ -380,7 +379,6 @@ def _write_half(path):
             raise RuntimeError(path)
 
 
-@pytest.mark.once
 @pytest.mark.parametrize(
     ("name", "kind"),
     [

@@ -67,7 +67,6 @@ def test_six_skins_descend_along_the_locus():
         np.testing.assert_allclose(found, np.clip(found, low, high), rtol=0, atol=NEAR)
 
 
-@pytest.mark.once
 def test_a_projected_picture_is_the_picture_of_projected_weights():
     """Where the kernel has gain 1."""
     body, matrix = sphere(200), sj.io.spectrum_to_rgb(WAVELENGTHS)
@@ -85,7 +84,6 @@ def test_a_projected_picture_is_the_picture_of_projected_weights():
     np.testing.assert_allclose(picture(weights) @ matrix, three, atol=1e-5)
 
 
-@pytest.mark.once
 def test_pigments_to_weights_are_one_program():
     """In a process of its own: where all channels were computed at once, it never ended."""
     program = """

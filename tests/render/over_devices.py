@@ -18,28 +18,29 @@ from benchmarks.communication import Picture, View, counted
 
 # mm; where the balls stand, away from the origin of all coordinates.
 PLACE = np.asarray([40.0, -25.0, 15.0])
+LAMP = np.add(PLACE, [-60.0, 10.0, 20.0])
 
 
 def scene(count: int = 1501, variances=(0.1, 12.5, 100.0)) -> sj.Scene:
     """Two balls, the last splats before the first, of a number that eight does not divide; layers
     of three kinds.
     """
-    behind = sphere(count - count // 5, 20.0, PLACE, jitter=0.0)
-    before = sphere(count // 5, 6.0, PLACE + np.asarray([-8.0, 6.0, 30.0]), jitter=0.0)
-    splats = joined(behind, before)
-    shade = 0.6 + 0.3 * jnp.sin((splats.centers - jnp.asarray(PLACE[None], float)) / 5)
-    splats = with_albedo(splats, shade)
+    splats = joined(
+        sphere(count - count // 5, 20.0, PLACE, jitter=0.0),
+        sphere(count // 5, 6.0, np.add(PLACE, [-8.0, 6.0, 30.0]), jitter=0.0),
+    )
+    splats = with_albedo(splats, 0.6 + 0.3 * np.sin((np.asarray(splats.centers) - PLACE) / 5))
     weights = [[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]][-len(variances) :]
-    material = sj.Material(sj.SumOfGaussians(variances, weights))
-    sun = sj.DirectionalLight([0.4, -0.5, -1.0], jnp.ones(3))
-    place = PLACE + np.asarray([-60.0, 10.0, 20.0])
-    lamp = sj.PointLight(place, 2000 * jnp.ones(3), cast_shadows=False)
-    return sj.Scene(splats, (sun, lamp), material)
+    lights = (
+        sj.DirectionalLight([0.4, -0.5, -1.0], [1, 1, 1]),
+        sj.PointLight(LAMP, [2000, 2000, 2000], cast_shadows=False),
+    )
+    return sj.Scene(splats, lights, sj.Material(sj.SumOfGaussians(variances, weights)))
 
 
 def camera(angle: float = 0.0) -> sj.Camera:
-    eye = jnp.asarray(PLACE + np.asarray([80 * np.sin(angle), 6.0, 80 * np.cos(angle)]), float)
-    return sj.Camera.look_at(eye, jnp.asarray(PLACE, float), fov=34.0, width=44, height=40)
+    eye = np.add(PLACE, [80 * np.sin(angle), 6.0, 80 * np.cos(angle)])
+    return sj.Camera.look_at(eye, PLACE, fov=34.0, width=44, height=40)
 
 
 @eqx.filter_jit
@@ -59,19 +60,17 @@ def splats_cut() -> dict:
 
 def strata_cut() -> dict:
     """Environment and area light, seen and differentiated in the light alone."""
-    image = np.random.default_rng(4).uniform(0.1, 2.0, (6, 12, 3))
-    place = PLACE + np.asarray([-60.0, 10.0, 20.0])
     lights = (
-        sj.EnvironmentLight(image, count=5),
-        sj.scene.RectangleLight(place, 6.0, [[0, 0, 20], [0, 20, 0]], count=3),
+        sj.EnvironmentLight(np.random.default_rng(4).uniform(0.1, 2.0, (6, 12, 3)), count=5),
+        sj.scene.RectangleLight(LAMP, 6.0, [[0, 0, 20], [0, 20, 0]], count=3),
     )
     bare, eye = scene(), camera()
 
     def found(mesh):
-        plan = sj.make_plan(sj.Scene(bare.splats, lights, bare.material), eye, TILED, mesh=mesh)
+        plan = sj.make_plan(replace(bare, lights=lights), eye, TILED, mesh=mesh)
 
         def loss(lights):
-            frame = sj.render(sj.Scene(bare.splats, lights, bare.material), eye, TILED, plan)
+            frame = sj.render(replace(bare, lights=lights), eye, TILED, plan)
             return jnp.mean(frame.beauty**2), frame
 
         return eqx.filter_jit(eqx.filter_grad(loss, has_aux=True))(lights)
@@ -88,7 +87,7 @@ def light_and_unshadowed_splats_cut() -> dict:
             for mesh in meshes
         )
     )
-    return light | _apart_on_eight(sj.Scene(world.splats, world.lights[1:], world.material))
+    return light | _apart_on_eight(replace(world, lights=world.lights[1:]))
 
 
 def _apart_on_eight(world: sj.Scene) -> dict:
@@ -144,17 +143,11 @@ def traffic() -> dict:
     mesh = jax.make_mesh((8,), ("splats",))
     world = scene(1504)
     plan = sj.make_plan(world, camera(), TILED, mesh=mesh)
-    world = eqx.tree_at(
-        lambda each: each.splats,
-        world,
-        jax.device_put(world.splats, NamedSharding(mesh, PartitionSpec("splats"))),
-    )
+    splats = jax.device_put(world.splats, NamedSharding(mesh, PartitionSpec("splats")))
     program = jax.jit(
-        lambda splats: sj.render(
-            sj.Scene(splats, world.lights, world.material), camera(), TILED, plan
-        )
+        lambda splats: sj.render(replace(world, splats=splats), camera(), TILED, plan)
     )
-    found = counted(program.lower(world.splats).compile().as_text())
+    found = counted(program.lower(splats).compile().as_text())
     layers = len(plan.diffusion.gaussians)
     shadows = [each.raster for each in plan.shadows if each is not None]
     picture = Picture(
@@ -166,13 +159,8 @@ def traffic() -> dict:
         lights=2,
         splats=len(plan.order),
     )
-    model = picture.traffic()
-    model = {
-        "summed": model.summed,
-        "scattered": model.scattered / 8,
-        "gathered": model.gathered,
-        "sent": picture.sent(8),
-    }
+    model = vars(picture.traffic()) | {"sent": picture.sent(8)}
+    model["scattered"] /= 8
     return {"model": model, "counted": vars(found) | {"sent": found.sent(8)}}
 
 
@@ -182,7 +170,7 @@ def _capacity(raster) -> tuple[int, int]:
 
 def views_cut() -> dict:
     world, cameras = scene(97), [camera(angle) for angle in (0.0, 1.0, 2.0)]
-    world = sj.Scene(world.splats, world.lights[1:], world.material)
+    world = replace(world, lights=world.lights[1:])
     plan = sj.make_plan(world, cameras, PLAIN)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
     mesh = jax.make_mesh((8,), ("views",))
@@ -210,18 +198,15 @@ def over_processes(what: str, index: str, count: str, port: str) -> dict:
     """
     jax.distributed.initialize(f"127.0.0.1:{port}", int(count), int(index))
     mesh = jax.make_mesh((jax.device_count(),), ("splats",))
-    world, eye = (
-        scene(1504, variances=(16.0, 100.0)),
-        camera(),
-    )  # a layer of single splats, and one of clusters
-    cut = NamedSharding(mesh, PartitionSpec("splats"))
-    splats = jax.tree.map(lambda leaf: jax.device_put(leaf, cut), world.splats)
+    # A layer of single splats, and one of clusters.
+    world, eye = scene(1504, variances=(16.0, 100.0)), camera()
+    splats = jax.device_put(world.splats, NamedSharding(mesh, PartitionSpec("splats")))
 
     def found(splats, mesh):
-        plan = sj.make_plan(sj.Scene(splats, world.lights, world.material), eye, TILED, mesh=mesh)
+        plan = sj.make_plan(replace(world, splats=splats), eye, TILED, mesh=mesh)
 
         def draw(splats, plan):
-            return sj.render(sj.Scene(splats, world.lights, world.material), eye, TILED, plan)
+            return sj.render(replace(world, splats=splats), eye, TILED, plan)
 
         if what == "picture":
             return draw(splats, plan)
@@ -229,8 +214,7 @@ def over_processes(what: str, index: str, count: str, port: str) -> dict:
             eqx.filter_grad(lambda splats, plan: jnp.sum(draw(splats, plan).coverage ** 2))
         )(splats, plan)
 
-    answer = found(splats, mesh)
-    rows = []
+    answer, rows = found(splats, mesh), []
     if what == "gradients":
         rows = [shard.data.shape[0] for shard in answer.centers.addressable_shards]
         answer = process_allgather(answer, tiled=True)

@@ -10,8 +10,6 @@ from pathlib import Path
 import pytest
 from processes import free_port, run_together
 
-pytestmark = pytest.mark.once
-
 HERE = Path(__file__).parent
 ROUNDING = 3e-5  # of the largest number of its kind: sums of a thousand terms, in another order
 

@@ -16,8 +16,6 @@ import splatjax as sj
 from splatjax.render import _checks
 from splatjax.render._checks import check_scene
 
-pytestmark = pytest.mark.once
-
 SETTINGS = sj.RenderSettings(diffuser=sj.diffusion.DenseDiffuser())  # which needs no plan
 SMALL_MAPS = sj.RenderSettings(shadows=sj.splatting.ShadowSettings(resolution=64))
 

@@ -26,8 +26,6 @@ import splatjax as sj
 from splatjax.diffusion._clusters import LayerSources
 from splatjax.render._statistics import StreamStatistics
 
-pytestmark = pytest.mark.once
-
 ROUNDING = 3e-5  # of the largest number of its kind: sums of a thousand terms, in another order
 LAYERS = 2.5e-2  # 99% of the pixels; at points here and at splats there, with clusters of each part
 RIMS = 0.1  # where a pixel blends two surfaces, 0.07 measured

@@ -1,42 +1,52 @@
-"""Weights that vary over the body: the picture of a material, reciprocity, energy, refusals."""
+"""Weights that vary over the body, and layers that are summed at the splats: the picture of a
+material of separate layers, reciprocity, energy, gradients, refusals.
+"""
 
-import dataclasses
+from dataclasses import replace
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-from bodies import PLAIN, camera_over, lights_from_two_sides, sheet, sphere, two_gaussians, view
+from bodies import (
+    PLAIN,
+    assert_close,
+    assert_refused,
+    camera_over,
+    joined,
+    lights_from_two_sides,
+    sheet,
+    sphere,
+    two_gaussians,
+    view,
+    with_albedo,
+)
+from jax.test_util import check_grads
 
 import splatjax as sj
-from splatjax.diffusion import PlainMean, ShapeDiffuser
-
-pytestmark = pytest.mark.once
+from splatjax.diffusion import DenseDiffuser, ExitanceDiffuser, PlainMean, ShapeDiffuser
 
 SAME = 1e-6  # a picture of the same sums, in float32
 ALIKE = 1e-3  # pixels blend splats around them
 HALF, SIDE = 8, 16  # mm and pixels: a splat in the middle of each pixel
-FLAT = dataclasses.replace(PLAIN, kernel=PlainMean())
+FLAT, BOUNCE = replace(PLAIN, kernel=PlainMean()), replace(PLAIN, bounces=1)
 WHITE = sj.Material(sj.SumOfGaussians([0.5, 3.0], [[0.6] * 2, [0.4] * 2]), 1.0, 0.0)
 FACTORS = np.random.default_rng(2).uniform(0.1, 1.0, (2, 2))
 
 
 def with_factors(body: sj.Splats, factors) -> sj.Splats:
-    return dataclasses.replace(
-        body, weights=jnp.broadcast_to(factors, (body.count, *np.shape(factors)[-2:]))
-    )
+    return replace(body, weights=jnp.broadcast_to(factors, (body.count, *np.shape(factors)[-2:])))
 
 
 def test_even_factors_make_the_picture_of_a_material():
     """And of light that has bounced."""
     body, factors = sphere(200), np.random.default_rng(5).uniform(0.1, 1.0, (2, 3))
     gaussians = two_gaussians()
-    material = sj.Material(gaussians)
-    scaled = sj.Material(sj.SumOfGaussians(gaussians.variances, gaussians.weights * factors))
-    lights = [sj.DirectionalLight([-1.0, -0.4, -0.3], [2.0, 3.0, 1.0], cast_shadows=False)]
-    settings = dataclasses.replace(PLAIN, bounces=1)
+    scaled = sj.SumOfGaussians(gaussians.variances, gaussians.weights * factors)
+    light = sj.DirectionalLight([-1.0, -0.4, -0.3], [2.0, 3.0, 1.0], cast_shadows=False)
     varied, plain = (
-        np.asarray(sj.render(sj.Scene(splats, lights, of), view(), settings).beauty)
-        for splats, of in ((with_factors(body, factors), material), (body, scaled))
+        np.asarray(sj.render(sj.Scene(splats, light, sj.Material(of)), view(), BOUNCE).beauty)
+        for splats, of in ((with_factors(body, factors), gaussians), (body, scaled))
     )
     np.testing.assert_allclose(varied, plain, atol=SAME * plain.max(), rtol=0)
 
@@ -52,10 +62,8 @@ def exitance(material: sj.Material, splats: sj.Splats, source: int) -> np.ndarra
 def test_light_goes_both_ways_alike_between_stripes_and_none_is_added():
     """Where a kernel weighs light at its exit alone, both fail."""
     body = sheet(14.5, 1.0)
-    is_first = (body.centers[:, 0] < 0)[:, None, None]
-    splats = dataclasses.replace(
-        body, weights=jnp.where(is_first, jnp.asarray(FACTORS), jnp.asarray(FACTORS[::-1]))
-    )
+    is_first = (np.asarray(body.centers)[:, 0] < 0)[:, None, None]
+    splats = replace(body, weights=np.where(is_first, FACTORS, FACTORS[::-1]))
     places = [(7, 5), (7, 9)]  # row and column: 2.5 and 1.5 mm from the seam
     at = [
         np.argmin(np.sum((np.asarray(body.centers) - np.asarray([c - 7.5, 7.5 - r, 0])) ** 2, 1))
@@ -64,26 +72,85 @@ def test_light_goes_both_ways_alike_between_stripes_and_none_is_added():
     there, back = (exitance(WHITE, splats, i) for i in at)
     np.testing.assert_allclose(there[places[1]], back[places[0]], rtol=ALIKE)
     # Narrow light here and wide light there.
-    parted = jnp.where(
-        is_first, jnp.asarray([[1.0] * 2, [0] * 2]), jnp.asarray([[0.0] * 2, [1] * 2])
-    )
+    parted = np.where(is_first, [[1.0] * 2, [0] * 2], [[0.0] * 2, [1] * 2])
     for i in at:
-        assert np.all(exitance(WHITE, dataclasses.replace(body, weights=parted), i).sum((0, 1)) < 1)
+        assert np.all(exitance(WHITE, replace(body, weights=parted), i).sum((0, 1)) < 1)
 
 
-def test_what_cannot_be_combined_is_refused():
+def test_weights_that_cannot_be_combined_are_refused():
     body, light = sphere(90, 4.0, jitter=0.0), lights_from_two_sides()
     medium = sj.Medium([0.02, 0.05], [0.9, 1.2], 1.3)
-    material = dataclasses.replace(WHITE, medium=medium)
-    solved = dataclasses.replace(PLAIN, diffuser=ShapeDiffuser())
-    single = dataclasses.replace(WHITE, single_scattering=sj.SingleScattering(medium))
+    material = replace(WHITE, medium=medium)
+    solved = replace(PLAIN, diffuser=ShapeDiffuser())
+    single = replace(WHITE, single_scattering=sj.SingleScattering(medium))
     for factors, given, settings, words in (
         (np.ones((3, 2)), WHITE, PLAIN, "splats.weights.*3 Gaussians.*2"),
         (np.ones((2, 3)), WHITE, PLAIN, "splats.weights has 3 channels"),
         (np.ones((2, 2)), single, PLAIN, "single scattering.*splats.weights"),
         (np.ones((2, 2)), material, solved, "splats.weights.*ShapeDiffuser"),
     ):
-        with pytest.raises(ValueError, match=words):
-            sj.render(sj.Scene(with_factors(body, factors), light, given), view(), settings)
-    with pytest.raises(ValueError, match=r"Splats.weights must be.*-1"):
-        with_factors(body, -np.ones((2, 2)))
+        of = sj.Scene(with_factors(body, factors), light, given)
+        assert_refused(partial(sj.render, of, view(), settings), words)
+    negative = partial(with_factors, body, -np.ones((2, 2)))
+    assert_refused(negative, r"Splats.weights must be.*-1")
+
+
+SUMMED = replace(PLAIN, diffuser=ExitanceDiffuser(DenseDiffuser()))
+ERROR = 1e-2  # of the largest value: the gain is blended instead of the mass that it depends on
+
+
+def scene(body: sj.Splats) -> sj.Scene:
+    albedo = 0.6 + 0.3 * np.sin(np.asarray(body.centers[:, :1]) + np.arange(3))
+    lights = [replace(light, irradiance=[1.0, 1.5, 2.0]) for light in lights_from_two_sides()]
+    return sj.Scene(with_albedo(body, albedo), lights, sj.Material(two_gaussians()))
+
+
+def test_without_gain_the_picture_is_that_of_separate_layers():
+    """On splats of equal areas blending and summing are linear, also of light that has bounced."""
+    of = scene(sphere(300))
+    expected, frame = (
+        sj.render(of, view(), replace(settings, kernel=PlainMean(), bounces=1))
+        for settings in (PLAIN, SUMMED)
+    )
+    found = frame.diffuse, frame.specular, frame.layers[0]
+    atol = 1e-5 * float(jnp.max(expected.beauty))
+    assert_close(found, (expected.diffuse, expected.specular, frame.diffuse), atol=atol, rtol=0)
+
+
+def test_with_gain_the_picture_is_that_of_separate_layers_within_a_thin_sheet():
+    """The mass is nearly twice that of one face; it is even, except for the edges of the sheet."""
+    faces = (sheet(8.0, 0.5, (0.0, 0.0, way), (0.0, 0.0, 0.1 * way), 0.2) for way in (1.0, -1.0))
+    light = sj.DirectionalLight([-0.6, 0.1, -1.0], [2.0, 1.0, 1.0], cast_shadows=False)
+    of = replace(scene(joined(*faces)), lights=light)
+    expected, frame, without = (
+        np.asarray(sj.render(of, camera_over(4.0, 16), settings).diffuse)
+        for settings in (PLAIN, SUMMED, FLAT)
+    )
+    error, gain = (np.abs(other - expected).max() for other in (frame, without))
+    assert error < ERROR * expected.max() < 0.1 * gain
+
+
+def test_summed_layers_have_their_derivatives(float64):
+    of = scene(sphere(100))
+    plan = sj.make_plan(of, view(size=8), SUMMED)
+
+    def beauty(centers, albedo, weights, variances):
+        splats = replace(of.splats, centers=centers, albedo=albedo)
+        material = sj.Material(sj.SumOfGaussians(variances, weights))
+        return sj.render(sj.Scene(splats, of.lights, material), view(size=8), SUMMED, plan).beauty
+
+    gaussians = of.material.gaussians
+    given = of.splats.centers, of.splats.albedo, gaussians.weights, gaussians.variances
+    check_grads(jax.jit(beauty), given, 1, ["rev"], atol=1e-5, rtol=1e-5, eps=1e-6)
+
+
+def test_separate_layers_of_a_sum_are_refused():
+    of = scene(sphere(100))
+    plan = sj.make_plan(of, view(), SUMMED)
+    for render in (sj.diffusion_basis, sj.picture_jacobian):
+        assert_refused(partial(render, of, view(), SUMMED, plan), "DenseDiffuser")
+    diffuse = partial(sj.diffuse_irradiance, of, jnp.ones((100, 3)), view(), SUMMED, plan)
+    assert_refused(diffuse, "ExitanceDiffuser has no separate layers")
+    for diffuser in (ShapeDiffuser(), ExitanceDiffuser()):
+        message = rf"layers is a {type(diffuser).__name__}"
+        assert_refused(partial(ExitanceDiffuser, diffuser), message)

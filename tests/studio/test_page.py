@@ -17,8 +17,6 @@ import splatjax as sj
 from splatjax.cli._studio import Studio
 from splatjax.studio import Page, Session
 
-pytestmark = pytest.mark.once
-
 SIDE = 48  # of the pictures of `studio`, pixels
 
 # Of viser and of the libraries that it stands on.

@@ -16,9 +16,6 @@ from splatjax.diffusion import ShapeDiffuser
 from splatjax.scattering import HalfSpace
 from splatjax.studio import Search, Session, save, turned
 
-pytestmark = pytest.mark.once
-
-
 # Levels of 255: rounding.
 SAME = 1
 # The mean of a picture of 375 splats and 16 x 16 pixels.

@@ -11,8 +11,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 import splatjax as sj
 from splatjax.studio import Session, widget
 
-pytestmark = pytest.mark.once
-
 EVENT = {"buttons": (1,), "type": "pointer_move"}
 
 
