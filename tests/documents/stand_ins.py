@@ -61,13 +61,8 @@ def _map(path: Path) -> None:
 
 def _measured(path: Path) -> None:
     radii = np.linspace(0.5, 10, 20)
-    values = np.asarray(sj.Dipole(sj.load_medium("marble"))(jnp.asarray(radii)), np.float64)
-    np.savetxt(
-        path,
-        np.column_stack([radii, values]),
-        delimiter=",",
-        header="radius (mm), red, green, blue",
-    )
+    rows = np.column_stack([radii, sj.Dipole(sj.load_medium("marble"))(radii)])
+    np.savetxt(path, rows, delimiter=",", header="radius (mm), red, green, blue")
 
 
 def _dot(path: Path) -> None:
@@ -78,11 +73,11 @@ def _dot(path: Path) -> None:
 
 def _marble(splats: sj.Splats, specular: float, **view) -> np.ndarray:
     """Render marble as howto/recover.md lists its pictures."""
-    splats = dataclasses.replace(splats, albedo=None)
-    camera = sj.Camera.look_at(**view, width=_SIDE, height=_SIDE)
-    lamp = sj.DirectionalLight([1, -0.3, -0.5], 3.14)
     material = dataclasses.replace(sj.load_material("marble"), specular=specular)
-    return np.asarray(sj.render(sj.Scene(splats, lamp, material), camera).beauty)
+    lamp = sj.DirectionalLight([1, -0.3, -0.5], 3.14)
+    scene = sj.Scene(dataclasses.replace(splats, albedo=None), lamp, material)
+    camera = sj.Camera.look_at(**view, width=_SIDE, height=_SIDE)
+    return np.asarray(sj.render(scene, camera).beauty)
 
 
 def _photograph(path: Path) -> None:
@@ -142,12 +137,10 @@ WITH_CONTEXT = {
 
 
 def context() -> dict[str, Any]:
-    bust = sj.bust(900)
-    splats = sj.Splats(bust.centers / 8, bust.normals, bust.radii / 8, bust.areas / 64)
+    splats = sj.bust(900).scaled(1 / 8).without_maps()
     camera = sj.Camera.look_at([8, 0, 70], [0, -3.5, 0], fov=32.0, width=_SIDE, height=_SIDE)
     lights = (sj.DirectionalLight([-1, -0.3, -0.4], jnp.full(3, jnp.pi)),)
-    material = dataclasses.replace(sj.load_material("marble"), specular=0.0)
-    scene = sj.Scene(splats, lights, material)
+    scene = sj.Scene(splats, lights, dataclasses.replace(sj.load_material("marble"), specular=0.0))
     plan = sj.make_plan(scene, camera)
     picture = np.asarray(sj.render(scene, camera, plan=plan).beauty)
     return {
@@ -164,7 +157,7 @@ def context() -> dict[str, Any]:
         "cameras": jax.tree.map(lambda leaf: jnp.stack([leaf] * jax.device_count()), camera),
         "lights": lights,
         "medium": sj.load_medium("marble"),
-        "material": material,
+        "material": scene.material,
         "scene": scene,
         "plan": plan,
         "picture": picture,

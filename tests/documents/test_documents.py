@@ -1,5 +1,6 @@
 """Every command of README and docs is understood, every name and link leads somewhere, every
-program names what is there; what commands and programs can do on small stand-ins is run.
+program names what is there; what commands and programs can do on small stand-ins is run. Words that
+were replaced stay out of names, of docstrings and comments, and of pages.
 """
 
 import ast
@@ -11,6 +12,8 @@ import os
 import pkgutil
 import re
 import shlex
+import tokenize
+import tomllib
 from pathlib import Path
 
 import equinox as eqx
@@ -66,16 +69,9 @@ SMALL = {
     "recover": ["--count", "3", "--no-suggest"],
 }
 
-NOT_RUN = {
-    "make": (
-        "sets up an environment, runs this suite or takes long; that there is such a "
-        "target is tested"
-    ),
-    "python": (
-        "benchmarks and tools take minutes or hours; that there is such a module "
-        "with such options is tested"
-    ),
-}
+# These take minutes or hours: that there is such a target, and such a module with such options, is
+# tested.
+NOT_RUN = "make", "python"
 
 typed = [
     pytest.param(command, id=f"{name(page)}-{number}")
@@ -111,10 +107,8 @@ targets = set(
 
 @pytest.mark.parametrize("command", [command for command in others if command.startswith("make")])
 def test_make_has_such_a_target(command):
-    used = [
-        word for word in shlex.split(command)[1:] if not word.startswith("-") and "=" not in word
-    ]
-    assert set(used) <= targets
+    words = shlex.split(command)[1:]
+    assert {word for word in words if not word.startswith("-") and "=" not in word} <= targets
 
 
 @pytest.mark.parametrize(
@@ -123,9 +117,8 @@ def test_make_has_such_a_target(command):
 def test_a_workflow_makes_what_there_is(workflow):
     text = workflow.read_text(encoding="utf-8")
     used = set(re.findall(r"run: make ([a-z-]+)$", text, re.MULTILINE))
-    used |= {
-        target for several in re.findall(r"suite: \[(.*)\]", text) for target in several.split(", ")
-    }
+    for several in re.findall(r"suite: \[(.*)\]", text):
+        used |= set(several.split(", "))
     assert used
     assert used <= targets
 
@@ -134,17 +127,12 @@ def test_a_workflow_makes_what_there_is(workflow):
 def test_there_is_such_a_module_with_such_options(command):
     first, *rest = shlex.split(command)[1:]
     if first == "-c" or rest[:1] == ["pytest"]:
-        places = [ROOT / word for word in rest if "/" in word]
-        assert all(place.exists() for place in places)
+        assert all((ROOT / word).exists() for word in rest if "/" in word)
         return
     path = ROOT / (rest.pop(0).replace(".", "/") if first == "-m" else first)
     path = path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
     source = path.read_text(encoding="utf-8")
     assert [word for word in rest if word.startswith("--") and f'"{word}"' not in source] == []
-
-
-def _small_scene(entry: re.Match[str]) -> str:
-    return f"{entry[1]} = {min(int(entry[2]), 1500 if entry[1] == 'bust' else 32)}"
 
 
 @pytest.mark.long
@@ -161,13 +149,14 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
     lay_out(tmp_path, page.read_text(encoding="utf-8"))
     for body in fences(page, "toml"):
         if file := re.match(r"# (\S+\.toml)\n", body):  # a file that a page lists
-            body = re.sub(r"\b(bust|width|height) = (\d+)", _small_scene, body)
+            body = re.sub(r"\bbust = \d+", "bust = 1500", body)
+            body = re.sub(r"\b(width|height) = \d+", r"\1 = 32", body)
             (tmp_path / file[1]).write_text(body, encoding="utf-8")
     for command in commands(page):
         given = words(command)
-        if not command.startswith("splatjax") or given[0].startswith("-") or "--help" in given:
-            continue
-        if given[0] == "studio":  # a page that stays until it is interrupted
+        # The page of `studio` stays until it is interrupted.
+        is_other = not command.startswith("splatjax") or given[0].startswith("-")
+        if is_other or "--help" in given or given[0] == "studio":
             continue
         is_scene = given[0] == "render" and given[1].endswith((".toml", ".exr"))
         small = [] if is_scene else SMALL.get(given[0], [])
@@ -322,3 +311,43 @@ def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
             # Pixels that do not count are NaN in these.
             if not jax.tree_util.keystr(path).startswith((".pictures", ".residuals")):
                 assert not np.any(np.isnan(leaf)), what
+
+
+WORDS = tomllib.loads((Path(__file__).parent / "glossary.toml").read_text(encoding="utf-8"))
+PHRASES = re.compile(rf"\b({'|'.join(WORDS['prose'])})\b".replace(" ", r"\s+"), re.IGNORECASE)
+FOLDERS = ("splatjax", "tests", "tools", "benchmarks", "notebooks", "docs")
+MORE = [*ROOT.glob("*.md"), *(ROOT / each for each in ("Makefile", "mkdocs.yml", "pyproject.toml"))]
+
+
+def in_prose(text: str, line: int = 1) -> list[tuple[int, str, str]]:
+    """Return line, words and replacement of each listed phrase of a text that begins in a line."""
+    return [
+        (line + text.count("\n", 0, match.start()), words, WORDS["prose"][words])
+        for match in PHRASES.finditer(text)
+        for words in [" ".join(match[0].lower().split())]
+    ]
+
+
+def in_code(path: Path) -> list[tuple[int, str, str]]:
+    """Return line, words and replacement of each listed name and phrase of a module."""
+    faults, before = [], ""
+    with tokenize.open(path) as file:
+        for token in tokenize.generate_tokens(file.readline):
+            if token.type == tokenize.COMMENT or token.string.lstrip("rf").startswith('"""'):
+                faults += in_prose(token.string, token.start[0])
+            elif token.string in WORDS["identifiers"] and before != ".":  # of other libraries
+                faults.append((token.start[0], token.string, WORDS["identifiers"][token.string]))
+            before = token.string
+    return faults
+
+
+def test_words_that_were_replaced_do_not_come_back():
+    faults = {path: in_code(path) for each in FOLDERS for path in (ROOT / each).rglob("*.py")}
+    pages = [*MORE, *(path for each in FOLDERS for path in (ROOT / each).rglob("*.md"))]
+    faults |= {path: in_prose(path.read_text(encoding="utf-8")) for path in pages}
+    lines = [
+        f"{path.relative_to(ROOT)}:{line}: {words!r}, use {use!r}"
+        for path, found in faults.items()
+        for line, words, use in found
+    ]
+    assert not lines, "\n".join(lines)
