@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 
 import splatjax as sj
@@ -14,3 +16,14 @@ def studio():
     session = Session(sj.Scene(splats, lights, sj.load_material("marble")), camera, [0, 0, 0])
     session.picture(session.start)  # whose plan serves all changes
     return session
+
+
+@pytest.fixture(scope="module")
+def another(studio):
+    """Return how to begin a session of the scene with some fields changed."""
+
+    def begin(settings=sj.RenderSettings(), skin=None, **fields):
+        scene, camera = replace(studio.own, **fields), studio.camera(studio.start)
+        return Session(scene, camera, [0, 0, 0], settings=settings, skin=skin)
+
+    return begin

@@ -1,21 +1,25 @@
 """The page of a studio: with viser, `pip install viser`; and in a browser, with `pip install
-playwright` and Debian's chromium.
+playwright` and Debian's chromium. The studio in a cell of a notebook, driven as a browser drives
+it: by values and events.
 """
 
+import asyncio
 import dataclasses
 import io
 import shutil
 import time
 
 import equinox as eqx
+import ipywidgets
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from pictures import write_picture
 from PIL import Image
 
 import splatjax as sj
 from splatjax.cli._studio import Studio
-from splatjax.studio import Page, Session
+from splatjax.studio import Page, widget
 
 SIDE = 48  # of the pictures of `studio`, pixels
 
@@ -34,11 +38,9 @@ def wait_until(is_true) -> None:
 
 
 @pytest.fixture
-def page(studio, tmp_path):
-    pytest.importorskip("viser")
-    session = Session(studio.own, studio.camera(studio.start), [0, 0, 0])
+def page(another, tmp_path):
     (tmp_path / "saved").mkdir()
-    page = Page(session, tmp_path / "saved", port=18_080)
+    page = Page(another(), tmp_path / "saved", port=18_080)
     yield page
     page.close()
 
@@ -55,7 +57,7 @@ def test_only_this_computer_reaches_the_page_and_it_writes_to_one_folder(page, t
     wait_until(lambda: len([*tmp_path.rglob("studio_*.*")]) == len(names))
     assert sorted(path.name for path in (tmp_path / "saved").iterdir()) == names
     saved = sj.load_medium(tmp_path / "saved" / "studio_001.toml").sigma_a
-    np.testing.assert_allclose(saved, 2 * sj.load_medium("marble").sigma_a, rtol=1e-6)
+    assert_allclose(saved, 2 * sj.load_medium("marble").sigma_a, rtol=1e-6)
     wait_until(lambda: "studio_000.png" in page._status.content)
     page._change("/../PDF")  # a fault is a sentence, and the page goes on
     wait_until(lambda: "Error" in page._status.content)
@@ -82,7 +84,7 @@ def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp
     press(searching.controls)
     wait_until(lambda: "error bars" in searching._stage.content)
     powers = [searching._handles[f"sigma_a {channel}"].value for channel in (1, 2, 3)]
-    np.testing.assert_allclose(powers, np.log2(1.5), atol=0.06)
+    assert_allclose(powers, np.log2(1.5), atol=0.06)
     wait_until(lambda: searching._status.content == "")
     assert np.abs(searching._compared.image[:, SIDE:].astype(int) - 128).max() <= 1
     searching.close()
@@ -170,7 +172,6 @@ bounces = 1
 
 @VISER
 def test_a_scene_file_opens_and_what_is_saved_is_one(tmp_path):
-    pytest.importorskip("viser")
     scene, looks = tmp_path / "scene.toml", tmp_path / "looks"
     scene.write_text(SCENE)
     (tmp_path / "maps").mkdir()
@@ -191,10 +192,112 @@ def test_a_scene_file_opens_and_what_is_saved_is_one(tmp_path):
     assert eqx.tree_equal(saved, of_exr)
     assert settings.bounces == 1
     lamp, sky = saved.lights[1], saved.lights[0]
-    np.testing.assert_allclose(lamp.intensity, 250)
+    assert_allclose(lamp.intensity, 250)
     assert float(sky.rotation) == 30.0
     picture = sj.render(of_exr, camera, settings)
     assert picture.beauty.max() > 0.1
-    np.testing.assert_allclose(
-        picture.beauty, sj.read_exr(looks / "studio_001.exr").beauty, atol=0.004
-    )
+    assert_allclose(picture.beauty, sj.read_exr(looks / "studio_001.exr").beauty, atol=0.004)
+
+
+EVENT = {"buttons": (1,), "type": "pointer_move"}
+
+
+@pytest.fixture
+def shown(another, tmp_path):
+    return widget(another(), tmp_path / "saved")
+
+
+def parts(box) -> list:
+    """List a widget and all that is in it."""
+    return [box, *(part for child in getattr(box, "children", ()) for part in parts(child))]
+
+
+def found(box, kind: type, label: str):
+    (part,) = [p for p in parts(box) if isinstance(p, kind) and p.description == label]
+    return part
+
+
+def labels(box) -> list[str]:
+    return [part.value for part in parts(box) if isinstance(part, ipywidgets.Label)]
+
+
+def canvas(box):
+    return box.children[0].children[0]
+
+
+def drawn(box) -> list[np.ndarray]:
+    """Return the pictures that a browser gets, at once and when nothing moves any more."""
+    sent = []
+
+    async def look():
+        canvas(box).send_frame = sent.append
+        sent.append(canvas(box).get_frame())
+        await asyncio.sleep(0.5)
+
+    asyncio.run(look())
+    return sent
+
+
+def test_a_widget_shows_the_picture_of_its_controls(shown, studio, another):
+    assert shown.controls == studio.start
+    next(s for s in parts(shown) if getattr(s, "description", "") == "all").value = 1.0
+    found(shown, ipywidgets.FloatSlider, "exposure, stops").value = 0.5
+    doubled = tuple(2 * number for number in studio.start.sigma_a)
+    assert shown.controls == dataclasses.replace(studio.start, sigma_a=doubled, exposure=0.5)
+    draft, picture = drawn(shown)
+    session = another()
+    assert_array_equal(draft, session.draft(shown.controls))
+    assert_array_equal(picture, session.picture(shown.controls))
+    text = " ".join(part.value for part in parts(shown) if isinstance(part, ipywidgets.HTML))
+    assert f"absorption: {doubled[0]:.4g}" in text
+    assert "<svg" in text
+
+
+def test_a_mouse_orbits_zooms_moves_and_picks(shown):
+    def send(**event) -> None:
+        canvas(shown).handle_event(EVENT | event)
+
+    def place() -> np.ndarray:
+        return np.asarray([shown.controls.eye, shown.controls.target])
+
+    before = place()
+    send(type="pointer_down", x=24, y=20)
+    send(x=36, y=20)  # a quarter of the picture's height, to the right: half a right angle
+    turned = place()
+    assert_allclose(turned[:, 1], before[:, 1])
+    angle = np.angle(complex(turned[0, 2], turned[0, 0]) / complex(before[0, 2], before[0, 0]))
+    assert_allclose(np.degrees(angle), -45)
+    send(x=36, y=1000)  # not beyond the pole
+    assert 0 < np.hypot(place()[0, 0], place()[0, 2]) < 0.02 * place()[0, 1]
+    assert_allclose(np.linalg.norm(place()[0]), np.linalg.norm(before[0]))
+    send(type="pointer_up", x=36, y=1000)
+    send(x=10, y=10, buttons=())  # no button, no change
+    found(shown, ipywidgets.Button, "first view").click()
+    assert_array_equal(place(), before)
+    # The target moves as many pixels as the mouse.
+    camera = sj.Camera.look_at(*before, width=48, height=48)
+    send(x=34, y=16, buttons=(2,))
+    shift = camera.rotation @ (before[1] - place()[1])
+    depth = np.linalg.norm(before[0] - before[1])
+    assert_allclose(shift * camera.focal_length * 48 / depth, [24, 6, 0], atol=1e-4)
+    found(shown, ipywidgets.Button, "first view").click()
+    send(type="wheel", dy=500 * np.log(2))
+    assert_allclose(place()[0], 2 * before[0])
+    found(shown, ipywidgets.Button, "first view").click()
+    send(type="pointer_down", x=24.3, y=20.8)
+    send(type="pointer_up", x=24.3, y=20.8)
+    drawn(shown)
+    texts = [part.value for part in parts(shown) if isinstance(part, ipywidgets.HTML)]
+    assert any("pixel 24, 20" in text for text in texts)
+
+
+def test_a_widget_writes_to_its_folder_and_shows_a_fault(shown, tmp_path):
+    found(shown, ipywidgets.Button, "material").click()
+    (path,) = (tmp_path / "saved").iterdir()
+    assert sj.load_material(path).channels == 3
+    assert f"saved {path}" in labels(shown)
+    path.rename(tmp_path / "kept.toml")
+    (tmp_path / "saved").rmdir()
+    (tmp_path / "saved").write_text("a file")
+    found(shown, ipywidgets.Button, "PNG").click()
+    assert any("exists" in label for label in labels(shown))
