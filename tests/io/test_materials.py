@@ -62,8 +62,8 @@ def test_jensens_and_narasimhans_media_skin_and_five_made_up_are_shipped():
 
 def test_coefficients_are_those_published(tmp_path):
     milk = load_medium("regular_milk")
-    np.testing.assert_allclose(milk.sigma_s_prime, [4.5513, 5.8294, 7.136], rtol=1e-6)
-    np.testing.assert_allclose(milk.sigma_a, [0.0015333, 0.0046, 0.019933], rtol=1e-6)
+    published = [[4.5513, 5.8294, 7.136], [0.0015333, 0.0046, 0.019933]]
+    np.testing.assert_allclose([milk.sigma_s_prime, milk.sigma_a], published, rtol=1e-6)
     dermis = load_profile("skin_layers").layers[1]
     np.testing.assert_allclose(dermis.medium.sigma_s_prime, [3.2, 4.0, 4.6], rtol=1e-6)
     np.testing.assert_allclose(dermis.thickness, 2.0)
@@ -83,8 +83,7 @@ def test_every_material_loads_and_has_its_source(dtype, name):
     assert (has_angles and name not in PIGMENTED) == (material.medium is not None)
     assert {leaf.dtype for leaf in jax.tree.leaves(material)} == {jnp.dtype(dtype)}
     text = (profiles_folder() / f"{name}.toml").read_text(encoding="utf-8")
-    assert "citation = " in text
-    assert "provenance = " in text
+    assert {"citation", "provenance"} <= tomllib.loads(text)["source"].keys()
 
 
 def test_skin_is_as_published():
@@ -143,9 +142,13 @@ def test_a_saved_material_comes_back_bit_for_bit(tmp_path, model):
     once = SingleScattering(Medium([1 / 7, 0.2], 3.0, 1.4), [1 / 3, 1.0])
     profile, path = PROFILES[model], tmp_path / "a.toml"
     medium = profile.medium if isinstance(profile, Dipole) else None
-    optional = {"single_scattering": once, "medium": medium}
-    angles = AngularLaw([[0.7, 1.3], [0.2, -0.4], [0.1, 0.1]])
-    material = sj.Material(gaussians, 1.37, 0.1, 1.0, angles=angles, **optional)
+    material = sj.Material(
+        gaussians,
+        *(1.37, 0.1, 1.0),
+        angles=AngularLaw([[0.7, 1.3], [0.2, -0.4], [0.1, 0.1]]),
+        single_scattering=once,
+        medium=medium,
+    )
     source, fit = {"citation": 'Me, "2024"'}, {"error": [0.1, 0.2], "count": 2}
     save_material(material, path, profile=profile, source=source, fit=fit, g=0.75)
     assert eqx.tree_equal((load_material(path), load_profile(path)), (material, profile))
@@ -180,8 +183,8 @@ def test_a_medium_may_be_given_in_other_ways(tmp_path):
     path = tmp_path / "wax.toml"
     path.write_text(GOOD_MEDIUM.replace("1/mm", "1/cm").replace("_prime", "") + "g = 0.75\n")
     medium = load_medium(path)
-    np.testing.assert_allclose(medium.sigma_a, 0.01, rtol=1e-6)
-    np.testing.assert_allclose(medium.sigma_s_prime, 0.025, rtol=1e-6)
+    found = medium.sigma_a, medium.sigma_s_prime
+    np.testing.assert_allclose(found, [[0.01], [0.025]], rtol=1e-6)
     assert load_mean_cosine(path) == 0.75
     path.write_text(COLOR)
     found = HalfSpace(load_medium(path), load_mean_cosine(path))
