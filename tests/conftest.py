@@ -173,11 +173,7 @@ def pytest_collection_finish():
 
 
 def pytest_report_header():
-    precision = "float64" if jax.config.jax_enable_x64 else "float32"
-    folder = shared_folder()
-    where = (
-        f"shared files from {folder}"
-        if folder
-        else "tests marked `shared` are left out: SPLATJAX_SHARED names no folder"
-    )
-    return f"splatjax in {precision}; {where}"
+    where = "tests marked `shared` are left out: SPLATJAX_SHARED names no folder"
+    if shared_folder() is not None:
+        where = f"shared files from {shared_folder()}"
+    return f"splatjax in {jnp.zeros(()).dtype}; {where}"

@@ -77,20 +77,19 @@ def test_numbers_lists_and_tuples_become_strongly_typed_arrays(make):
 
 def test_a_number_stands_for_every_entry_of_an_axis_that_others_have():
     np.testing.assert_array_equal(medium().eta, jnp.full(3, 1.4))
-    assert sj.scattering.Multipole(sj.Layer(medium(), 3)).eta_above.shape == (3,)
-    assert sj.SingleScattering(medium(), 0.5).strength.shape == (3,)
-    assert splats().radii.shape == splats(specular=0.5).specular.shape == (2,)
-    assert sj.Medium(0.1, 1, 1.4).eta.shape == (1,)
-    assert sj.SumOfGaussians([0.1, 2], [0.3, 0.5]).weights.shape == (2, 1)
-    assert sj.inverse.Observation(
-        np.ones((2, 2, 3)), camera(), light(), deviation=1
-    ).deviation.shape == (
-        2,
-        2,
-        3,
-    )
+    observation = sj.inverse.Observation(np.ones((2, 2, 3)), camera(), light(), deviation=1)
     scene = sj.Scene(splats(), light(), material())
-    assert [one.irradiance.shape for one in scene.lights] == [(3,)]
+    for field, shape in (
+        (sj.scattering.Multipole(sj.Layer(medium(), 3)).eta_above, (3,)),
+        (sj.SingleScattering(medium(), 0.5).strength, (3,)),
+        (splats().radii, (2,)),
+        (splats(specular=0.5).specular, (2,)),
+        (sj.Medium(0.1, 1, 1.4).eta, (1,)),
+        (sj.SumOfGaussians([0.1, 2], [0.3, 0.5]).weights, (2, 1)),
+        (observation.deviation, (2, 2, 3)),
+        (scene.lights[0].irradiance, (3,)),
+    ):
+        assert field.shape == shape
     assert isinstance(sj.Scene(splats(), [light(), light()], material()).lights, tuple)
 
 
