@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from functools import partial
 from importlib import util
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pygltflib
 import pytest
+from bodies import assert_close, assert_refused
 from pxr import Gf, Usd, UsdGeom, UsdShade
 
 import splatjax as sj
@@ -35,7 +37,7 @@ TRIANGLES = Mesh(
 def a_scene(*lights, medium: Medium | None = MEDIUM, has_albedo: bool = False) -> sj.Scene:
     """Splats at the corners of `TRIANGLES`, of a different albedo each."""
     albedo = np.arange(12).reshape(4, 3) / 15 if has_albedo else None
-    splats = sj.Splats(TRIANGLES.vertices, TRIANGLES.normals, [1.0] * 4, [3.0] * 4, albedo)
+    splats = sj.Splats(TRIANGLES.vertices, TRIANGLES.normals, 1.0, 3.0, albedo)
     return sj.Scene(splats, lights, sj.Material(GAUSSIANS, 1.4, 0.5, 0.25, medium=medium))
 
 
@@ -76,15 +78,14 @@ def test_gltf_has_the_camera_and_the_lights(tmp_path, float64):
     """As the importers read them, which are compared with files of other programs."""
     save_gltf(path := tmp_path / "it.glb", a_scene(*PUNCTUAL), CAMERA, lux=0.1)
     camera = load_camera(path, "camera", mm_per_unit=1000.0)
-    np.testing.assert_allclose(camera.position, CAMERA.position, atol=1e-9)
-    np.testing.assert_allclose(camera.rotation, CAMERA.rotation, atol=1e-9)
+    expected = CAMERA.position, CAMERA.rotation
+    assert_close((camera.position, camera.rotation), expected, atol=1e-9)
     np.testing.assert_allclose(camera.focal_length, CAMERA.focal_length, rtol=1e-9)
     found = load_lights(path, mm_per_unit=1000.0, lux=0.1)
     for light, truth in zip(found, PUNCTUAL, strict=True):
         assert type(light) is type(truth)
         points = jnp.asarray([[0, 0, 0], [52, 50, 9.0]])
-        for got, right in zip(light.incidence(points), truth.incidence(points), strict=True):
-            np.testing.assert_allclose(got, right, rtol=1e-6, atol=1e-9)
+        assert_close(light.incidence(points), truth.incidence(points), rtol=1e-6, atol=1e-9)
 
 
 def test_the_coefficients_return_from_gltf(tmp_path, float64):
@@ -111,12 +112,11 @@ def test_usd_has_the_surface_of_materialx(tmp_path, float64, medium):
     """In meters, and with the color of the splats where they have one."""
     scene = a_scene(medium=medium)
     stage = usd(tmp_path / "it.usda", scene, CAMERA)
-    surface = "/scene/material/ND_open_pbr_surface_surfaceshader"
-    found, truth = values(stage, surface), sj.exports.openpbr_subsurface(scene.material)
+    found = values(stage, "/scene/material/ND_open_pbr_surface_surfaceshader")
     path = 1000 * found["subsurface_radius"] * found["subsurface_radius_scale"]
-    np.testing.assert_allclose(path, sj.exports.mean_free_path(scene.material), rtol=1e-6)
-    np.testing.assert_allclose(found["subsurface_color"], truth["subsurface_color"], rtol=1e-6)
-    np.testing.assert_allclose(found["specular_ior"], 1.4, rtol=1e-6)
+    color = sj.exports.openpbr_subsurface(scene.material)["subsurface_color"]
+    expected = sj.exports.mean_free_path(scene.material), color, 1.4
+    assert_close((path, found["subsurface_color"], found["specular_ior"]), expected, rtol=1e-6)
     stage = usd(tmp_path / "of_splats.usda", a_scene(has_albedo=True), CAMERA)
     body = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/scene/body"))
     material, _ = body.ComputeBoundMaterial()
@@ -137,8 +137,8 @@ def test_lights_of_usd_shine_alike(tmp_path, float64):
         sj.EnvironmentLight(image, 30, [1, 2, 4], up=[0, 0, 1]),
     )
     stage = usd(tmp_path / "it.usda", a_scene(*PUNCTUAL, *areas), CAMERA)
-    lights = [values(stage, f"/scene/light_{number}") for number in range(1, 8)]
-    poses = [pose(stage, f"/scene/light_{number}") for number in range(1, 8)]
+    names = [f"/scene/light_{number}" for number in range(1, 8)]
+    lights, poses = ([read(stage, name) for name in names] for read in (values, pose))
     for light, of, place in zip((*PUNCTUAL, *areas), lights, poses, strict=True):
         scale = np.pi * (1000 * of["radius"]) ** 2 if isinstance(light, sj.PointLight) else 1.0
         scale = scale if not isinstance(light, SpotLight) else np.pi
@@ -185,10 +185,8 @@ def test_the_body_is_the_mesh_or_a_hexagon_for_each_splat(tmp_path):
 
 def test_what_cannot_be_written_is_named(tmp_path, monkeypatch):
     glb, usda = tmp_path / "it.glb", tmp_path / "it.usda"
-    beam, two = (
-        sj.GaussianBeam([0, 0, 9], [0, 0, -1], 5.0, 4.0),
-        sj.SumOfGaussians([1.0], [[0.5] * 2]),
-    )
+    beam = sj.GaussianBeam([0, 0, 9], [0, 0, -1], 5.0, 4.0)
+    two = sj.SumOfGaussians([1.0], [[0.5] * 2])
     with pytest.warns(UserWarning, match=r"it\.glb: .*4 \(GaussianBeam\), .* 5 \(SphereLight"):
         save_gltf(glb, a_scene(*PUNCTUAL, beam, SphereLight([9, 9, 9], 1.0, 2.0)), CAMERA)
     assert len(load_lights(glb, mm_per_unit=1.0)) == 3
@@ -205,9 +203,7 @@ def test_what_cannot_be_written_is_named(tmp_path, monkeypatch):
             (save_gltf, tmp_path / "it.gltf", a_scene()),
             (save_usd, tmp_path / "it.usdz", a_scene()),
         ):
-            with pytest.raises(ValueError, match=path.name):
-                save(path, given, CAMERA)
+            assert_refused(partial(save, path, given, CAMERA), path.name)
         monkeypatch.setattr(util, "find_spec", lambda name: None)
-        with pytest.raises(ValueError, match=r"it\.usda: .*usd-core"):
-            save_usd(usda, a_scene(), CAMERA)
+        assert_refused(partial(save_usd, usda, a_scene(), CAMERA), r"it\.usda: .*usd-core")
     assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
