@@ -57,7 +57,7 @@ def transforms(tmp_path):
     """The first image of COLMAP as colmap2nerf.py of instant-ngp writes it: camera to world, with
     the columns of down and forward reversed.
     """
-    camera = load_cameras(FILES / "colmap", mm_per_unit=1.0)["left 1.png"]
+    camera = in_mm(FILES / "colmap")["left 1.png"]
     pose = np.eye(4)
     pose[:3] = np.column_stack([np.asarray(camera.rotation).T * [1, -1, -1], camera.position])
     content = json.loads(TRANSFORMS)
@@ -86,8 +86,8 @@ def test_cameras_of_colmap_show_what_colmap_shows(double, folder):
 def test_cameras_of_nerf_have_the_axes_of_opengl(double, transforms):
     camera = load_cameras(transforms(), mm_per_unit=MM)["left 1.png"]
     np.testing.assert_allclose(pixels(camera, POINTS), COLMAP["left 1.png"], atol=PIXELS)
-    half = transforms("fl_x fl_y cx cy", camera_angle_x=2 * np.arctan(320 / 600.5))
-    camera = load_cameras(half, mm_per_unit=MM)["left 1.png"]
+    centered = transforms("fl_x fl_y cx cy", camera_angle_x=2 * np.arctan(320 / 600.5))
+    camera = load_cameras(centered, mm_per_unit=MM)["left 1.png"]
     expected = np.asarray(COLMAP["left 1.png"]) - [310.25 - 320, 251.5 - 240]
     np.testing.assert_allclose(pixels(camera, POINTS), expected, atol=PIXELS)
 

@@ -105,11 +105,8 @@ def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> sj.Frame
 
 
 def columns_of(splats, kind="f4"):
-    columns = xyz(splats.normals, ("nx", "ny", "nz")) | {
-        "radius": splats.radii,
-        "area": splats.areas,
-    }
-    columns |= xyz(splats.centers)
+    vectors = xyz(splats.centers) | xyz(splats.normals, ("nx", "ny", "nz"))
+    columns = vectors | {"radius": splats.radii, "area": splats.areas}
     return {name: np.asarray(columns[name], kind) for name in sorted(columns, reverse=True)}
 
 

@@ -114,8 +114,7 @@ def test_a_convex_body_receives_nothing_of_itself():
 def test_opposite_squares_receive_by_their_form_factor():
     """Two squares of 20 mm, 20 mm apart: 0.1998 of what leaves one arrives at the other."""
     lower, upper = sheet(9.75, 0.5), sheet(9.75, 0.5, (0.0, 0.0, -1.0), (0.0, 0.0, 20.0))
-    lamp = sj.DirectionalLight([0, 0, 1], [1, 2, 3], cast_shadows=False)
-    scene = sj.Scene(joined(lower, upper), lamp, MATTE)
+    scene = sj.Scene(joined(lower, upper), replace(SUN, direction=[0, 0, 1]), MATTE)
     direct, bounced = received(scene, 0), received(scene, 1)
     gained = (bounced - direct)[:, : lower.count].mean(axis=1)
     exact = 0.1998 * np.asarray(MATTE.total_reflectance()) * direct[:, lower.count :].mean(axis=1)
@@ -144,9 +143,8 @@ def test_derivatives_in_light_material_and_albedo(float64):
     def weighed(strength, weights, variances, albedo, normals):
         material = sj.Material(sj.SumOfGaussians(variances, weights))
         lit = replace(with_albedo(body, albedo), normals=normals)
-        lamp = sj.DirectionalLight([0, 0, -1], strength, cast_shadows=False)
-        irradiance = sj.compute_irradiance(sj.Scene(lit, lamp, material), plan, settings)
-        return jnp.vdot(factors, irradiance.source)
+        scene = sj.Scene(lit, replace(SUN, irradiance=strength), material)
+        return jnp.vdot(factors, sj.compute_irradiance(scene, plan, settings).source)
 
     gaussians, albedo = MATTE.gaussians, jnp.full((body.count, 3), 0.6)
     given = jnp.ones(3), gaussians.weights, gaussians.variances, albedo, body.normals
@@ -187,7 +185,6 @@ REFUSED = {
 
 
 @pytest.mark.once
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_bounce_is_refused_by_name(case):
-    call, message = REFUSED[case]
+@pytest.mark.parametrize(("call", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_bounce_is_refused_by_name(call, message):
     assert_refused(call, message)

@@ -37,6 +37,7 @@ from splatjax.scene import (
 
 BARE = sj.Material(two_gaussians(), eta=1.0, specular=0.0)
 GLOSSY = sj.Material(two_gaussians(), specular=1.0, roughness=0.4)
+SINGLE = sj.SingleScattering(sj.Medium([0.1, 0.02, 0.5], [0.9, 0.98, 0.5], 1.3))
 CAMERA = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=24, width=24, height=24)
 SHADOWS = sj.splatting.ShadowSettings(resolution=512)
 TILES = sj.RenderSettings(
@@ -96,10 +97,7 @@ def test_an_environment_of_one_pixel_is_a_directional_light():
 def test_an_environment_is_the_sum_of_its_samples_in_every_layer():
     """Its shadow is theirs, weighted by the light that each would bring to the sheet."""
     body = joined(sheet(6.0, 0.4), sphere(150, 2.0, (-1.0, 2.0, 4.0)))
-    medium = sj.Medium([0.1, 0.02, 0.5], [0.9, 0.98, 0.5], 1.3)
-    material = sj.Material(
-        two_gaussians(), eta=1.0, specular=0.0, single_scattering=sj.SingleScattering(medium)
-    )
+    material = dataclasses.replace(BARE, single_scattering=SINGLE)
     sky = sj.EnvironmentLight(np.random.default_rng(1).uniform(size=(4, 8, 3)) ** 4, count=6)
     lamps = [sj.DirectionalLight(each.direction, each.irradiance) for each in sky.samples()]
     camera = sj.Camera.look_at([0, -30, 30], [0, 0, 0], fov=14, width=24, height=24)
@@ -123,13 +121,10 @@ def test_a_turned_map_is_a_body_turned_back(up):
     about_y = np.asarray([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
     x, y = np.asarray([1.0, 0.0, 0.0]), np.asarray(up)
     rotation = np.stack([x, y, np.cross(x, y)], axis=1) @ about_y
-    normals = np.asarray(BODY.normals, float)
-    back = sj.Splats(BODY.centers, normals @ rotation, BODY.radii, BODY.areas)
-    turned = sj.EnvironmentLight(harmonics(), 50.0, up=up, cast_shadows=False)
+    back = dataclasses.replace(BODY, normals=np.asarray(BODY.normals, float) @ rotation)
     straight = sj.EnvironmentLight(harmonics(), cast_shadows=False)
-    np.testing.assert_allclose(
-        received(turned, BODY), received(straight, back), rtol=1e-4, atol=1e-2
-    )
+    turned = received(dataclasses.replace(straight, rotation=50.0, up=up), BODY)
+    np.testing.assert_allclose(turned, received(straight, back), rtol=1e-4, atol=1e-2)
 
 
 @pytest.mark.once
@@ -267,13 +262,16 @@ def test_another_environment_of_the_size_compiles_nothing_and_keeps_the_plan(com
 def test_maps_of_merged_splats_let_in_the_light_that_full_maps_do():
     """A small ball beside a large one: eight splats to a disc, and a sixteenth of the pixels."""
     scene = sj.Scene(BODY, sj.EnvironmentLight(harmonics(), count=8), BARE)
-    coarse = sj.splatting.ShadowSettings(resolution=64, compared=2, merged_spacing=6.0)
-    entering = []
-    for shadows in (sj.splatting.ShadowSettings(resolution=256), coarse):
-        settings = dataclasses.replace(TILES, sample_shadows=shadows)
-        entering.append(irradiance(scene, settings))
-    assert sj.make_plan(scene, CAMERA, settings).shadows[0].splats_per_disc == 8
-    full, found = entering
+    shadows = sj.splatting.ShadowSettings
+    fine, coarse = (
+        dataclasses.replace(TILES, sample_shadows=each)
+        for each in (
+            shadows(resolution=256),
+            shadows(resolution=64, compared=2, merged_spacing=6.0),
+        )
+    )
+    full, found = irradiance(scene, fine), irradiance(scene, coarse)
+    assert sj.make_plan(scene, CAMERA, coarse).shadows[0].splats_per_disc == 8
     assert np.sqrt(np.mean((found - full) ** 2)) < 0.04 * np.mean(full)
     assert np.mean(found) == pytest.approx(np.mean(full), rel=0.02)
 
@@ -327,10 +325,7 @@ def test_environments_are_read_and_large_ones_averaged(tmp_path):
     )
 
 
-MEDIUM = sj.Medium([0.1, 0.02, 0.5], [0.9, 0.98, 0.5], 1.3)
-SCATTERED_ONCE = sj.Material(
-    two_gaussians(), specular=0.5, single_scattering=sj.SingleScattering(MEDIUM)
-)
+SCATTERED_ONCE = sj.Material(two_gaussians(), specular=0.5, single_scattering=SINGLE)
 TWO_BALLS = joined(sphere(500, 10.0), sphere(100, 3.0, (4.0, 6.0, 12.0)))
 HARMONIC = {64: 0.03, 256: 0.004}  # largest error of the irradiance, by count
 

@@ -27,11 +27,11 @@ def scene_under(*lights: sj.scene.AbstractLight, splats: sj.Splats | None = None
 
 
 def lamp(*direction: float, cast_shadows: bool = True) -> sj.DirectionalLight:
-    return sj.DirectionalLight(jnp.asarray(direction, float), jnp.ones(3), cast_shadows)
+    return sj.DirectionalLight(direction, [1, 1, 1], cast_shadows)
 
 
 def point(height: float) -> sj.PointLight:
-    return sj.PointLight([0.0, 0.0, height], 100 * jnp.ones(3), cast_shadows=False)
+    return sj.PointLight([0.0, 0.0, height], [100, 100, 100], cast_shadows=False)
 
 
 def of_four_gaussians() -> sj.Material:

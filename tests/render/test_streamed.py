@@ -45,18 +45,13 @@ STRATA = (
     sj.scene.SphereLight([-60, 10, 20], 4.0, 10.0, count=2),
 )
 LIGHTS = (
-    sj.DirectionalLight(jnp.asarray([0.4, -0.5, -1.0], float), jnp.ones(3)),
-    sj.PointLight(jnp.asarray([-60.0, 10.0, 20.0], float), 2000 * jnp.ones(3), cast_shadows=False),
+    sj.DirectionalLight([0.4, -0.5, -1.0], [1, 1, 1]),
+    sj.PointLight([-60, 10, 20], [2000, 2000, 2000], cast_shadows=False),
 )
 MATERIAL = sj.Material(
-    sj.SumOfGaussians(
-        jnp.asarray([0.1, 9.0, 60.0], float),
-        jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float),
-    )
+    sj.SumOfGaussians([0.1, 9.0, 60.0], [[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]])
 )
-CAMERA = sj.Camera.look_at(
-    jnp.asarray([20.0, 6.0, 78.0], float), jnp.zeros(3), fov=34.0, width=44, height=40
-)
+CAMERA = sj.Camera.look_at([20, 6, 78], [0, 0, 0], fov=34.0, width=44, height=40)
 
 
 @pytest.fixture(scope="module")
