@@ -23,7 +23,7 @@ from scipy.ndimage import binary_erosion
 
 import splatjax as sj
 from splatjax.diffusion import PlainMean, ShapeDiffuser
-from splatjax.geometry import Mesh, sample_mesh, vertex_normals
+from splatjax.geometry import Mesh, bust_mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
 
 SIZE = 128  # pixels along a side
@@ -59,8 +59,12 @@ def head() -> trimesh.Trimesh:
     path = Path("data", "lee_perry_smith", "LeePerrySmith_closed.ply")
     if "SPLATJAX_SHARED" not in os.environ:
         raise ValueError(f"SPLATJAX_SHARED is not set; the head needs the folder with {path}")
-    mesh = trimesh.load(Path(os.environ["SPLATJAX_SHARED"]) / path, process=False)
-    return mesh.apply_scale(MM_PER_UNIT).subdivide_loop(2)
+    path = Path(os.environ["SPLATJAX_SHARED"]) / path
+    return trimesh.load(path, process=False).apply_scale(MM_PER_UNIT).subdivide_loop(2)
+
+
+def bust() -> trimesh.Trimesh:
+    return trimesh.Trimesh(bust_mesh().vertices, bust_mesh().faces, process=False)
 
 
 def box(depth: float) -> trimesh.Trimesh:
@@ -78,6 +82,7 @@ sphere = functools.partial(trimesh.creation.icosphere, 6, 10.0)
 FROM_SPHERE = (0, 0, 80), (0, 0, 0), 18, 150_000
 FROM_SHEET = (30, 20, 80), (0, 0, -1), 30, 150_000
 FROM_HEAD = (250, 100, 800), (0, 70, 0), 19, 683_549
+BUST, FROM_BUST = "the built-in bust", ((250, 0, 800), (0, -40, 0), 22, 300_000)
 STUDIO = sj.EnvironmentLight(sj.scene.studio())
 BODIES = [
     Body("sphere", f"{SPHERE}, lit from the side", sphere, lamp(-1, -1, -1), *FROM_SPHERE),
@@ -128,6 +133,15 @@ BODIES = [
         sj.scene.RectangleLight.facing([250, 250, 350], [0, 70, 0], 300, 300, [10.0] * 3),
         *FROM_HEAD,
     ),
+    Body("bust", f"{BUST}, lit from the front", bust, lamp(-0.7, -0.5, -1), *FROM_BUST),
+    Body("bust_studio", f"{BUST} in the studio", bust, STUDIO, *FROM_BUST),
+    Body(
+        "bust_softbox",
+        f"{BUST} beside a square light of 300 x 300",
+        bust,
+        sj.scene.RectangleLight.facing([250, 180, 350], [0, -30, 0], 300, 300, [10.0] * 3),
+        *FROM_BUST,
+    ),
     Body(
         "ear",
         "its ear, lit from behind",
@@ -141,7 +155,10 @@ BODIES = [
 ]
 
 # A frame of the solved head takes one to two minutes.
-UNSOLVED = "head_studio", "head_refracting", "head_softbox"
+UNSOLVED = (
+    *("head_studio", "head_refracting", "head_softbox"),
+    *("bust", "bust_studio", "bust_softbox"),
+)
 PICTURED = "sphere", "sphere_refracting", "sheet4", "head", "head_refracting"
 PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"
 BEGIN, END = "<!-- table: tools/make_bodies.py -->", "<!-- end of table -->"
@@ -311,7 +328,7 @@ def main() -> None:
     for body in chosen:
         truth, splats, pictures = read_truth(body, folder), splats_of(body), {}
         print(f"{body.name}: {np.sum(~truth.sound)} pixels of the truth left out", flush=True)
-        has_folds = body.shape is head
+        has_folds = body.shape in (head, bust)
         for name, (material, settings) in models(body.eta).items():
             is_solved = isinstance(settings.diffuser, ShapeDiffuser)
             if (settings.bounces and not has_folds) or (is_solved and body.name in UNSOLVED):
@@ -326,7 +343,8 @@ def main() -> None:
             columns = {"the default": "escape normalization and angles", "all terms": last}
             shown.append((truth, {title: pictures[name] for title, name in columns.items()}))
         jax.clear_caches()  # the programs of all bodies are more than one process may hold
-    draw(shown, folder / "bodies.webp")
+    if shown:
+        draw(shown, folder / "bodies.webp")
     if chosen == BODIES:
         before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
         table = "\n".join([*rows, "", END])

@@ -30,7 +30,8 @@ _SLOPE_FILTER = 0.25  # pixels; see `widen_ellipse`
 CLOSED = 0.15
 # Unevenness of even and of scattered splats, and the fraction of their mean weight sum that covers
 # a pixel.
-_UNEVENNESS, _FRACTIONS = (0.1, 0.35), (0.75, 0.11)
+_UNEVENNESS, _FRACTIONS = (0.1, 0.35), (0.9, 0.11)
+_HIDDEN = 0.8  # of that sum: a front of this weight covers nine tenths of its pixel
 _MEAN_WEIGHT = (1 - 13 * math.exp(-4)) / 4  # `fragment_weight` over a disc
 
 
@@ -44,15 +45,15 @@ class SplattingSettings(eqx.Module):
       small splat's weights over the pixels is independent of its position between them, to 4%.
     - `epsilon_z`: fragments within this many radii behind the front belong to it (3.1).
     - `largest_slope`: slanted splats have epsilon lengthened by `1 / cos`, up to this factor.
-    - `full_coverage`: weight sum from which on a surface covers a pixel beside the background, at
-      most 1. `None` to derive it from the splats (`measured`).
+    - `full_coverage`: weight sum from which on a surface covers a pixel beside the background,
+      positive. `None` to derive it from the splats (`measured`).
     """
 
     filter_radius: float = eqx.field(static=True, default=2**0.5)
     epsilon_z: float = eqx.field(static=True, default=1.5)
     largest_slope: float = eqx.field(static=True, default=3.0)
     full_coverage: float | Float[Array, ""] | None = eqx.field(
-        default=None, metadata=valid("in (0, 1]", lambda x: (x > 0) & (x <= 1))
+        default=None, metadata=valid("positive", lambda x: x > 0)
     )
 
     @property
@@ -66,8 +67,8 @@ class SplattingSettings(eqx.Module):
 
     @property
     def hidden_from(self) -> Float[Array, ""]:
-        """The weight sum of a front from which on nothing is seen behind it."""
-        return jnp.maximum(jnp.asarray(self.covered_from), CLOSED)
+        """The weight sum of a front from which on what lies behind it is not drawn."""
+        return jnp.maximum(_HIDDEN * jnp.asarray(self.covered_from), CLOSED)
 
     def measured(
         self, unevenness: Float[Array, ""], discs: Float[Array, ""]
@@ -75,8 +76,9 @@ class SplattingSettings(eqx.Module):
         """Return these settings with a value for `full_coverage`: a fraction of the mean weight
         sum inside a surface of such splats.
 
-        The fraction is three quarters where splats are spread evenly, because the sum falls to a
-        half at an outline, and less the more it varies inside the surface.
+        The fraction is nine tenths where splats are spread evenly: the sum falls to a half at an
+        outline, and the step then covers half the pixel. The more the sum varies inside the
+        surface, the less the fraction.
 
         **Arguments:**
 
@@ -87,7 +89,7 @@ class SplattingSettings(eqx.Module):
             return self
         known = (jnp.asarray(values, unevenness.dtype) for values in (_UNEVENNESS, _FRACTIONS))
         fraction = jnp.interp(unevenness, *known)
-        full = jnp.minimum(fraction * _MEAN_WEIGHT * math.pi * discs, 1.0)
+        full = fraction * _MEAN_WEIGHT * math.pi * discs
         return dataclasses.replace(self, full_coverage=full)
 
 

@@ -297,7 +297,7 @@ def test_an_outline_is_where_the_body_ends_and_is_antialiased(size):
     coverage = covered(view, bodies.sphere(20_000, radius, jitter=0.0))
     scale = DISTANCE / float(view.pixel_size(jnp.asarray(DISTANCE)))
     seen = scale * np.tan(np.arcsin(radius / DISTANCE))
-    assert np.sqrt(np.sum(coverage) / np.pi) == pytest.approx(seen, abs=0.25)  # pixels
+    assert np.sqrt(np.sum(coverage) / np.pi) == pytest.approx(seen, abs=0.12)  # pixels
     assert np.sum((coverage > 0.05) & (coverage < 0.95)) > 0.6 * 2 * np.pi * seen
     y, x = np.mgrid[:size, :size] + 0.5 - size / 2
     assert np.min(coverage[np.hypot(x, y) < seen - 2]) > 0.999
@@ -341,7 +341,7 @@ def test_coverage_of_a_silhouette_is_differentiable(float64):
     check_grads(covered, (shift,), 1, ["rev"], atol=1e-5, rtol=1e-5, eps=1e-6)
 
 
-@pytest.mark.parametrize("full", [0.0, 1.5])
+@pytest.mark.parametrize("full", [0.0, -1.0])
 def test_full_coverage_that_no_surface_has_is_refused(full):
     with pytest.raises(ValueError, match="full_coverage"):
         SplattingSettings(full_coverage=full)
