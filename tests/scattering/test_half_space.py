@@ -47,23 +47,20 @@ def test_white_absorbs_nothing_in_single_precision():
     assert np.all(found.medium.sigma_a < 1e-4)
 
 
-def test_colors_are_those_of_openpbr(float64):
+@pytest.mark.parametrize("g", [0.0, 0.5])
+def test_colors_are_those_of_openpbr(float64, g):
     """Where indices match, up to the error of its formula (OpenPBR 1.1, "Subsurface")."""
     color = np.asarray([0.05, 0.2, 0.5, 0.8, 0.98])
     s = 4.09712 + 4.20863 * color - np.sqrt(9.59217 + 41.6808 * color + 17.7126 * color**2)
-    for g in (0.0, 0.5):
-        albedo = (1 - s**2) / (1 - g * s**2)
-        medium = sj.Medium(1 - albedo, (1 - g) * albedo, 1.0)
-        np.testing.assert_allclose(HalfSpace(medium, g).color(), color, atol=6e-3)
+    albedo = (1 - s**2) / (1 - g * s**2)
+    medium = sj.Medium(1 - albedo, (1 - g) * albedo, 1.0)
+    np.testing.assert_allclose(HalfSpace(medium, g).color(), color, atol=6e-3)
 
 
 def test_the_coefficients_of_a_color_have_its_derivative(float64):
-    def coefficients(color, mean_free_path):
-        medium = HalfSpace.of_color(color, mean_free_path, 1.4, 0.3).medium
-        return medium.sigma_a, medium.sigma_s_prime
-
     given = jnp.asarray([0.3, 0.6, 0.9]), jnp.asarray([1.0, 2.0, 3.0])
-    check_grads(jax.jit(coefficients), given, order=1, modes=["rev"], eps=1e-3, rtol=1e-2)
+    coefficients = jax.jit(lambda *given: HalfSpace.of_color(*given, 1.4, 0.3).medium)
+    check_grads(coefficients, given, order=1, modes=["rev"], eps=1e-3, rtol=1e-2)
 
 
 @pytest.mark.once
@@ -105,16 +102,13 @@ def test_energy_of_a_material_under_every_angle(eta):
     """Gaussians by their law and single scattering by its own are together what leaves by
     transport, and never more than came.
     """
-    space = half_space([0.9, 0.99], eta)
+    space, mu = half_space([0.9, 0.99], eta), jnp.asarray(COSINES, float)
     single = SingleScattering(space.medium)
-    separate = single.directional_albedo(jnp.asarray(COSINES, space.medium.eta.dtype))
-    law = space.angular_law(separate)
-    rest = space.total_reflectance() - separate[-1]
-    material = sj.Material(
-        sj.SumOfGaussians([1.0], rest[None]), single_scattering=single, angles=law
-    )
-    mu = jnp.asarray(COSINES, space.medium.eta.dtype)
-    leaving = separate + rest[None] * material.diffuse_fraction(mu)
+    separate = single.directional_albedo(mu)
+    rest = (space.total_reflectance() - separate[-1])[None]
+    given = {"single_scattering": single, "angles": space.angular_law(separate)}
+    material = sj.Material(sj.SumOfGaussians([1.0], rest), **given)
+    leaving = separate + rest * material.diffuse_fraction(mu)
     allowed = 2e-3 if eta > 1 else 0.02  # with matched indices no polynomial is right at grazing
     np.testing.assert_allclose(leaving[4:], space.directional_albedo()[4:], atol=allowed)
     assert np.all(np.asarray(leaving) <= 1)
@@ -122,30 +116,27 @@ def test_energy_of_a_material_under_every_angle(eta):
 
 def test_light_leaves_whole_and_reciprocally(dtype):
     x, weights = np.polynomial.legendre.leggauss(64)
-    mu = np.asarray((1 + x) / 2, dtype)
-    law = AngularLaw(np.asarray([[0.7, 1.3], [0.2, -0.4], [0.1, 0.1]], dtype))
-    surface = [np.asarray(each, dtype) for each in (0.028, [0.2] * 64)]
+    law = AngularLaw([[0.7, 1.3], [0.2, -0.4], [0.1, 0.1]])
+    mu, *surface = (jnp.asarray(each, dtype) for each in ((1 + x) / 2, 0.028, [0.2] * 64))
     leaves = jax.jit(sj.shading.diffuse_transmission)(mu, *surface, law)
     np.testing.assert_allclose(leaves @ (weights * mu), 1, atol=1e-4)
-    enters = (
-        law(jnp.asarray(mu)).T * (1 - jax.jit(sj.shading.directional_albedo)(mu, *surface))[None]
-    )
+    enters = law(mu).T * (1 - jax.jit(sj.shading.directional_albedo)(mu, *surface))[None]
     ratio = np.asarray(leaves / enters)
-    np.testing.assert_allclose(ratio, np.broadcast_to(ratio[:, :1], ratio.shape), rtol=1e-5)
+    np.testing.assert_allclose(ratio, np.repeat(ratio[:, :1], 64, axis=1), rtol=1e-5)
 
 
 @pytest.mark.once
 def test_a_photon_beam_takes_the_total_of_transport():
-    space = half_space([0.9, 0.99], 1.3)
-    beam = PhotonBeam(space.medium)
-    held = beam.with_total(space.total_reflectance())
-    np.testing.assert_allclose(held.total_reflectance(), space.total_reflectance(), rtol=1e-5)
-    assert np.all(
-        np.abs(np.asarray(beam.total_reflectance() / held.total_reflectance()) - 1) > 0.01
+    space, r = half_space([0.9, 0.99], 1.3), jnp.asarray([0.5, 2.0])
+    beam, single, total = (
+        PhotonBeam(space.medium),
+        SingleScattering(space.medium)(r),
+        space.total_reflectance(),
     )
-    r = jnp.asarray([0.5, 2.0])
-    single = SingleScattering(space.medium)(r)
-    ratio = np.asarray((held(r) - single) / (beam(r) - single))
+    held = beam.with_total(total)
+    np.testing.assert_allclose(held.total_reflectance(), total, rtol=1e-5)
+    assert np.all(np.abs(beam.total_reflectance() / total - 1) > 0.01)
+    ratio = (held(r) - single) / (beam(r) - single)
     np.testing.assert_allclose(ratio[0], ratio[1], rtol=1e-4)
 
 
@@ -155,21 +146,15 @@ def test_a_flat_piece_sends_back_what_the_law_says():
     """Under light and eye at an angle it is `e(mu_i) e(mu_o) / average` times as bright as a
     diffuser.
     """
-    law = AngularLaw([[1.4], [0.1], [-0.5]])
-    gaussians = sj.SumOfGaussians([1.0], [[0.6]])
+    gaussians, law = sj.SumOfGaussians([1.0], [[0.6]]), AngularLaw([[1.4], [0.1], [-0.5]])
     light = sj.DirectionalLight((-1, 0, -0.75), [1.0])  # cosine 0.6
     camera = sj.Camera.look_at((0, 60, 80), (0, 0, 0), fov=2, width=8, height=8)  # cosine 0.8
     material = sj.Material(gaussians, eta=1.0, specular=0, angles=law)
-    radiance = sj.render(sj.Scene(sheet(20.0, 1.0), light, material), camera, PLAIN).diffuse[
-        4, 4, 0
-    ]
-
-    def e(mu):
-        return 1.4 + 0.1 * mu - 0.5 * mu**2
-
+    frame = sj.render(sj.Scene(sheet(20.0, 1.0), light, material), camera, PLAIN)
+    e_i, e_o = (1.4 + 0.1 * mu - 0.5 * mu**2 for mu in (0.6, 0.8))
     average = 1.4 + 0.1 * 2 / 3 - 0.5 / 2
     plain = 0.6 * 0.6 / np.pi  # total reflectance, cosine
-    np.testing.assert_allclose(radiance, plain * e(0.6) * e(0.8) / average, rtol=1e-3)
+    np.testing.assert_allclose(frame.diffuse[4, 4, 0], plain * e_i * e_o / average, rtol=1e-3)
 
 
 @pytest.mark.once
@@ -225,13 +210,9 @@ def test_reflectance_lies_in_the_measured_range(name):
 
 @pytest.mark.once
 def test_hemoglobin_has_two_bands_with_oxygen_and_one_without():
-    at = [530, 545, 560, 575, 590]
-    full, empty = (
-        np.asarray(Skin(0.02, 0.02, oxygenation, wavelengths=at).half_space().total_reflectance())
-        for oxygenation in (1.0, 0.0)
-    )
-    assert full[1] < min(full[0], full[2])
-    assert full[3] < min(full[2], full[4])
+    skins = (Skin(0.02, 0.02, each, wavelengths=[530, 545, 560, 575, 590]) for each in (1.0, 0.0))
+    full, empty = (skin.half_space().total_reflectance() for skin in skins)
+    np.testing.assert_array_equal(np.sign(np.diff(full)), [-1, 1, -1, 1])
     assert np.argmin(empty) in (1, 2)
 
 
@@ -258,21 +239,30 @@ def test_reflectance_and_profile_are_those_of_monte_carlo(name):
 
 
 def test_derivatives_are_differences(float64):
-    names = ["melanin", "blood", "oxygenation", "eumelanin", "bilirubin", "thickness", "scattering"]
-    names += ["carotene", "water", "vessel_radius", "scattering_power", "eta", "g"]
-    at = [0.05, 0.03, 0.7, 0.6, 0.1, 0.07, 4.0, 1e-3, 0.6, 0.015, 1.3, 1.4, 0.7]
+    skin = {
+        "melanin": 0.05,
+        "blood": 0.03,
+        "oxygenation": 0.7,
+        "eumelanin": 0.6,
+        "bilirubin": 0.1,
+        "thickness": 0.07,
+        "scattering": 4.0,
+        "carotene": 1e-3,
+        "water": 0.6,
+        "g": 0.7,
+        "vessel_radius": 0.015,
+        "scattering_power": 1.3,
+        "eta": 1.4,
+    }
 
     def reflectance(values):
-        fields = dict(zip(names, values, strict=True))
+        fields = dict(zip(skin, values, strict=True))
         profile = Skin(**fields, wavelengths=[450, 575]).profile()
         return jnp.sum(profile.total_reflectance() + profile(jnp.asarray([0.4]))[0])
 
-    @jax.jit
-    def value_and_slope(values, way):
-        return jax.jvp(reflectance, (values,), (way,))
-
-    for i, name in enumerate(names):
-        way = np.asarray(at) * np.eye(len(names))[i]
+    value_and_slope = jax.jit(lambda at, way: jax.jvp(reflectance, (at,), (way,)))
+    at = np.asarray(list(skin.values()))
+    for name, way in zip(skin, np.diag(at), strict=True):
         (there, _), (_, slope), (back, _) = (
             value_and_slope(at + step * way, way) for step in (1e-4, 0.0, -1e-4)
         )

@@ -33,8 +33,7 @@ def image_sum(slab: Layer, eta_above: float, eta_below: float, r: np.ndarray, im
     channel.
     """
     medium, d = slab.medium, float(slab.thickness)
-    length = float(1 / medium.sigma_t_prime[0])
-    sigma_tr = float(jnp.sqrt(medium.squared_sigma_tr[0]))
+    length, sigma_tr = 1 / medium.sigma_t_prime[0], jnp.sqrt(medium.squared_sigma_tr[0])
     above, below = (
         2 / 3 * length * float(ExactFresnel().boundary(medium.eta / eta)[0])
         for eta in (eta_above, eta_below)
@@ -57,20 +56,20 @@ def image_sum(slab: Layer, eta_above: float, eta_below: float, r: np.ndarray, im
 @pytest.mark.parametrize("thickness", [1.35, 2.0, 8.0])
 def test_closed_form_is_the_image_sum(float64, thickness):
     slab = layer(0.032, 0.74, 1.3, thickness)
-    r = np.array([0.0, 0.03, 0.3, 1.0, 4.0, 10.0])
-    reflected, transmitted = image_sum(slab, 1.1, 1.0, r, 200)
+    r = jnp.asarray([0.0, 0.03, 0.3, 1.0, 4.0, 10.0])
     profile = Multipole(slab, eta_above=1.1, eta_below=1.0)
-    np.testing.assert_allclose(profile(jnp.asarray(r))[:, 0], reflected, rtol=1e-10)
-    np.testing.assert_allclose(profile.transmittance(jnp.asarray(r))[:, 0], transmitted, rtol=1e-10)
+    found = jnp.stack([profile(r), profile.transmittance(r)])[..., 0]
+    np.testing.assert_allclose(found, image_sum(slab, 1.1, 1.0, np.asarray(r), 200), rtol=1e-10)
 
 
 def test_a_slab_without_absorption_keeps_all_light(float64):
-    profile = Multipole(layer(0.0, 2.0, 1.4, 3.0), eta_above=1.1, eta_below=1.5)
-    np.testing.assert_allclose(
-        profile.total_reflectance() + profile.total_transmittance(), 1, rtol=1e-14
+    white, lossy = (
+        Multipole(layer(sigma_a, 2.0, 1.4, 3.0), eta_above=1.1, eta_below=1.5)
+        for sigma_a in (0.0, 1e-9)
     )
-    lossy = Multipole(layer(1e-9, 2.0, 1.4, 3.0), eta_above=1.1, eta_below=1.5)
-    np.testing.assert_allclose(lossy.total_reflectance(), profile.total_reflectance(), rtol=1e-7)
+    total = white.total_reflectance()
+    np.testing.assert_allclose(total + white.total_transmittance(), 1, rtol=1e-14)
+    np.testing.assert_allclose(lossy.total_reflectance(), total, rtol=1e-7)
 
 
 def test_a_thick_slab_is_the_half_space(float64):
@@ -88,44 +87,36 @@ def test_the_sum_of_images_has_its_derivatives_where_it_is_expanded(float64):
     """The even function of s, expanded about 0 and computed: values and derivatives meet at the
     border, `s H = 0.05`.
     """
-    a, b, fall = jnp.asarray(1.3), jnp.asarray(0.4), jnp.asarray(0.6)
-
-    def ratio(u):
-        return hyperbolic_ratio(u, a, b, fall, a + b + fall)
-
-    border = 0.05**2 / 2.3**2
-    below, above = (
-        jax.value_and_grad(ratio)(jnp.asarray(border * side)) for side in (1 - 1e-9, 1 + 1e-9)
-    )
+    depths = jnp.asarray([1.3, 0.4, 0.6, 2.3])
+    ratio = jax.value_and_grad(lambda u: hyperbolic_ratio(u, *depths))
+    border, s = 0.05**2 / 2.3**2, 0.7
+    below, above = (ratio(border * side) for side in (1 - 1e-9, 1 + 1e-9))
     np.testing.assert_allclose(below[0], above[0], rtol=1e-12)
     np.testing.assert_allclose(below[1], above[1], rtol=1e-7)
-    s = 0.7
     exact = np.sinh(s * 1.3) * np.cosh(s * 0.4) / np.sinh(s * 2.3)
-    np.testing.assert_allclose(ratio(jnp.asarray(s * s)), exact, rtol=1e-14)
-    np.testing.assert_allclose(ratio(jnp.asarray(0.0)), 1.3 / 2.3, rtol=1e-14)
+    np.testing.assert_allclose(ratio(s * s)[0], exact, rtol=1e-14)
+    np.testing.assert_allclose(ratio(0.0)[0], 1.3 / 2.3, rtol=1e-14)
 
 
 def test_a_stack_of_one_is_its_layer_and_a_film_of_no_depth_changes_nothing(float64):
     slab, lower = layer(*MARBLE_GREEN, 2.0), layer(0.02, 2.0, 1.3, INFINITE)
-    r, etas = jnp.asarray([0.0, 1.0]), {"eta_above": 1.2, "eta_below": 1.1}
-    one, film = Multipole(slab, **etas), Film(0.0)
+    r, etas, film = jnp.asarray([0.0, 1.0]), {"eta_above": 1.2, "eta_below": 1.1}, Film(0.0)
+    one = Multipole(slab, **etas)
     np.testing.assert_allclose(LayeredMultipole([slab], **etas)(r), one(r), rtol=1e-14)
     np.testing.assert_allclose(one.length_scale(), 1 / slab.medium.sigma_t_prime, rtol=1e-14)
-    bare = LayeredMultipole([slab, lower])(r)
-    films = LayeredMultipole([film, slab, film, lower])(r)
+    bare, films = (LayeredMultipole(s)(r) for s in ([slab, lower], [film, slab, film, lower]))
     np.testing.assert_allclose(films, bare, rtol=1e-12)
 
 
 def test_films_on_each_other_are_one(float64):
-    slab = layer(0.1, 3.0, 1.4, INFINITE)
-    thin, thick = Film(0.125), Film(0.25)
-    two, one = LayeredMultipole([thin, thin, slab]), LayeredMultipole([thick, slab])
-    np.testing.assert_allclose(two.total_reflectance(), one.total_reflectance(), rtol=1e-14)
-    bare = LayeredMultipole([slab]).total_reflectance()
-    # In as a beam, out as diffuse light: 0.779 and 0.649 of it at an optical depth of a quarter.
-    np.testing.assert_allclose(
-        one.total_reflectance() / bare, np.exp(-0.25) * 2 * expn(3, 0.25), rtol=1e-12
+    slab, thin = layer(0.1, 3.0, 1.4, INFINITE), Film(0.125)
+    bare, one, two = (
+        LayeredMultipole([*films, slab]).total_reflectance()
+        for films in ([], [Film(0.25)], [thin, thin])
     )
+    np.testing.assert_allclose(two, one, rtol=1e-14)
+    # In as a beam, out as diffuse light: 0.779 and 0.649 of it at an optical depth of a quarter.
+    np.testing.assert_allclose(one / bare, np.exp(-0.25) * 2 * expn(3, 0.25), rtol=1e-12)
 
 
 def test_diffuse_transmittance_is_an_exponential_integral(float64):
@@ -140,9 +131,9 @@ def test_the_seam_between_matched_halves(float64, free_paths, growth):
     """Each half keeps its own extrapolated boundary: transmittance grows by a known amount."""
     sigma_a, sigma_s_prime, eta = MARBLE_GREEN
     thickness = free_paths / (sigma_a + sigma_s_prime)
-    whole = LayeredMultipole([layer(*MARBLE_GREEN, thickness)], eta_above=eta, eta_below=eta)
-    halves = LayeredMultipole(
-        [layer(*MARBLE_GREEN, thickness / 2)] * 2, eta_above=eta, eta_below=eta
+    whole, halves = (
+        LayeredMultipole([layer(*MARBLE_GREEN, thickness / n)] * n, eta_above=eta, eta_below=eta)
+        for n in (1, 2)
     )
     found = halves.total_transmittance()[0] / whole.total_transmittance()[0] - 1
     assert abs(found - growth) < 5.1e-4
@@ -153,10 +144,8 @@ def test_the_seam_between_matched_halves(float64, free_paths, growth):
 def test_the_seam_without_absorption(float64):
     """Matched everywhere, `T = (l + z_b) / (d + 3 z_b - l)`."""
     d, length, boundary = 6.0, 0.5, 2 / 3 * 0.5
-    halves = LayeredMultipole([layer(0.0, 2.0, 1.0, d / 2)] * 2)
-    np.testing.assert_allclose(
-        halves.total_transmittance(), (length + boundary) / (d + 3 * boundary - length), rtol=1e-13
-    )
+    found = LayeredMultipole([layer(0.0, 2.0, 1.0, d / 2)] * 2).total_transmittance()
+    np.testing.assert_allclose(found, (length + boundary) / (d + 3 * boundary - length), rtol=1e-13)
 
 
 def test_three_layers_of_skin(float64):
@@ -181,26 +170,21 @@ def test_too_thin_is_refused(dtype):
         with pytest.raises(ValueError, match=r"thickness \* sigma_t' of a Layer .* 0\.78"):
             LayeredMultipole(stack)
 
-    @jax.jit
-    def traced(thickness):
-        return Multipole(layer(*MARBLE_GREEN, thickness)).total_reflectance()
-
-    assert np.isnan(traced(jnp.asarray(0.3))[0])
-    assert np.isfinite(traced(jnp.asarray(0.5))[0])
+    traced = jax.jit(lambda d: Multipole(layer(*MARBLE_GREEN, d)).total_reflectance())
+    assert np.isnan(traced(0.3)[0])
+    assert np.isfinite(traced(0.5)[0])
 
 
 @pytest.mark.shared
 def test_slab_against_monte_carlo(float64, monte_carlo):
-    data = monte_carlo("slab_marbleG_d2.0")
-    slab = Multipole(layer(*MARBLE_GREEN, 2.0))
+    data, slab = monte_carlo("slab_marbleG_d2.0"), Multipole(layer(*MARBLE_GREEN, 2.0))
     entering = 1 - data["Rsp"]
     np.testing.assert_allclose(slab.total_reflectance(), data["Rd"] / entering, rtol=2e-3)
     np.testing.assert_allclose(slab.total_transmittance(), data["Tt"] / entering, rtol=1.2e-2)
     # Beyond the spike of light that was not scattered, ring by ring.
-    r = np.asarray(data["r_opt"])[3:40]
-    found = np.asarray(slab.transmittance(jnp.asarray(r)))[:, 0]
-    reference = np.asarray(data["Tt_r"])[3:40] / entering
-    assert np.sqrt(np.sum(r * (found - reference) ** 2) / np.sum(r * reference**2)) < 0.06
+    r, reference = (np.asarray(data[name])[3:40] for name in ("r_opt", "Tt_r"))
+    off = slab.transmittance(jnp.asarray(r))[:, 0] * entering - reference
+    assert np.sqrt(np.sum(r * off**2) / np.sum(r * reference**2)) < 0.06
 
 
 ROUNDING = 1e-13  # of the value at the origin; 1e-15 is reached
@@ -267,34 +251,34 @@ TABLE = (
 )
 
 
-def moment(eta: float, power: int) -> float:
+def moments(model, eta: jax.Array) -> jax.Array:
+    return jnp.stack([model.first_moment(eta), model.second_moment(eta), model.boundary(eta)])
+
+
+@pytest.mark.parametrize("eta", INDICES)
+def test_exact_moments_are_the_integrals(float64, eta):
     """(power + 1) times the integral of mu^power F(mu), split at the critical angle."""
-    critical = np.sqrt(max(0.0, 1 - 1 / eta**2))
-    rest, _ = quad(
-        lambda mu: mu**power * reflectance(mu, eta),
-        critical,
-        1,
-        epsabs=1e-13,
-        epsrel=1e-12,
-        limit=400,
-    )
-    return critical ** (power + 1) + (power + 1) * rest
-
-
-def test_exact_moments_are_the_integrals(float64):
-    exact, index = ExactFresnel(), jnp.asarray(INDICES)
-    for power, found in ((1, exact.first_moment(index)), (2, exact.second_moment(index))):
-        expected = [moment(eta, power) for eta in INDICES]
-        np.testing.assert_allclose(found, expected, rtol=EXACT)
+    critical, found = np.sqrt(max(0.0, 1 - 1 / eta**2)), moments(ExactFresnel(), jnp.asarray([eta]))
+    for power in (1, 2):
+        rest, _ = quad(
+            lambda mu, power=power: mu**power * reflectance(mu, eta),
+            critical,
+            1,
+            epsabs=1e-13,
+            epsrel=1e-12,
+            limit=400,
+        )
+        expected = critical ** (power + 1) + (power + 1) * rest
+        np.testing.assert_allclose(found[power - 1], expected, rtol=EXACT)
 
 
 def test_moments_are_those_published(float64):
     index, *expected = np.transpose(TABLE)
-    models = ExactFresnel(), EganFresnel()
-    found = [model.first_moment(jnp.asarray(index)) for model in models]
-    found += [model.second_moment(jnp.asarray(index)) for model in models]
-    np.testing.assert_allclose(found, expected, atol=PRINTED)
-    np.testing.assert_allclose(found[::2], found[1::2], atol=POLYNOMIAL)
+    exact, egan = (
+        moments(model, jnp.asarray(index))[:2] for model in (ExactFresnel(), EganFresnel())
+    )
+    np.testing.assert_allclose([exact[0], egan[0], exact[1], egan[1]], expected, atol=PRINTED)
+    np.testing.assert_allclose(exact, egan, atol=POLYNOMIAL)
 
 
 def test_reciprocity_ties_inside_to_outside(float64):
@@ -308,18 +292,14 @@ def test_reciprocity_ties_inside_to_outside(float64):
 @pytest.mark.parametrize("model", [ExactFresnel(), EganFresnel()])
 def test_equal_indices_reflect_nothing(dtype, model):
     one = jnp.ones(1, dtype)
-    assert model.first_moment(one)[0] == 0
-    assert model.boundary(one)[0] == 1
-    assert abs(float(model.second_moment(one)[0])) < 1e-12
-    for moment_of in (model.first_moment, model.second_moment):
-        assert np.isfinite(jax.grad(lambda eta, f=moment_of: f(eta)[0])(one)[0])
+    first, second, boundary = moments(model, one)
+    np.testing.assert_array_equal([first, boundary], [[0], [1]])
+    np.testing.assert_allclose(second, 0, atol=1e-12)
+    assert np.all(np.isfinite(jax.jacobian(lambda eta: moments(model, eta))(one)))
 
 
 @pytest.mark.parametrize("model", [ExactFresnel(), EganFresnel()])
 def test_moments_have_their_derivatives(float64, model):
-    @jax.jit
-    def moments(eta):
-        return [of(eta) for of in (model.first_moment, model.second_moment, model.boundary)]
-
-    eta = jnp.asarray([0.7, 1.05, 1.3, 1.5])
-    check_grads(moments, (eta,), order=1, modes=["rev"], rtol=1e-6, eps=1e-5)
+    given = (jnp.asarray([0.7, 1.05, 1.3, 1.5]),)
+    function = jax.jit(lambda eta: moments(model, eta))
+    check_grads(function, given, order=1, modes=["rev"], rtol=1e-6, eps=1e-5)
