@@ -2,6 +2,7 @@
 pictures are linear in the weights, without a renderer.
 """
 
+from collections import namedtuple
 from functools import cache, partial
 
 import equinox as eqx
@@ -20,6 +21,7 @@ COUNT, SIZE, NOISE = 12, 6, 1e-3
 FALLS = np.asarray([[[0.5, 2.0], [1.0, 3.0]], [[1.0, 0.3], [2.0, 0.5]]])
 GAUSSIANS = [0.5, 3.0], [[0.4, 0.3], [0.2, 0.3]]
 START = {"dye": 0.2, "dirt": 0.1}
+Frame = namedtuple("Frame", ["beauty", "coverage", "overflow"])
 OPTIMIZER = optax.chain(optax.lbfgs(1.0, memory_size=24, linesearch=None), optax.clip(3.0))
 
 
@@ -42,12 +44,6 @@ def material() -> sj.Material:
     return sj.Material(sj.SumOfGaussians(*GAUSSIANS), specular=0)
 
 
-class Frame(eqx.Module):
-    beauty: jax.Array
-    coverage: jax.Array
-    overflow: jax.Array
-
-
 def linear(weights) -> jax.Array:
     """Sums over splats of the reflectance: each pixel its own."""
     shares = np.random.default_rng(3).uniform(0, 1, (SIZE, SIZE, COUNT)) ** 4
@@ -58,8 +54,7 @@ def linear(weights) -> jax.Array:
 @pytest.fixture
 def linear_pictures(monkeypatch):
     def render(scene, camera, settings, plan):
-        full = jnp.ones((SIZE, SIZE))
-        return Frame(linear(scene.splats.weights), full, jnp.zeros(()))
+        return Frame(linear(scene.splats.weights), jnp.ones((SIZE, SIZE)), jnp.zeros(()))
 
     monkeypatch.setattr(_fit_scene, "render", render)
 
@@ -85,12 +80,12 @@ class TestParameterMap:
         x = part.coordinates(PicturedScene(ball, camera(), ()))
         for name, values in part.maps(x, tables).items():
             np.testing.assert_allclose(values, START[name], rtol=1e-12)
-        moved = part.moved(PicturedScene(ball, camera(), ()), x, tables).splats
-        expected = jnp.broadcast_to(part.table.factors(START), moved.weights.shape)
-        np.testing.assert_allclose(moved.weights, expected, rtol=1e-12)
-        far = part.maps(jnp.full_like(x, 1e3), tables)
-        for name, (low, high) in zip(far, part.table.limits, strict=True):
-            assert np.all((far[name] >= low) & (far[name] <= high))
+        moved = part.moved(PicturedScene(ball, camera(), ()), x, tables).splats.weights
+        expected = jnp.broadcast_to(part.table.factors(START), moved.shape)
+        np.testing.assert_allclose(moved, expected, rtol=1e-12)
+        far = part.maps(jnp.full_like(x, 1e3), tables).values()
+        for values, (low, high) in zip(far, part.table.limits, strict=True):
+            assert np.all((values >= low) & (values <= high))
 
     def test_a_coordinate_changes_the_color_by_a_step(self):
         """Without blur and prior, in all directions alike, where parameters resemble each other."""
@@ -171,18 +166,16 @@ class TestFits:
             return jnp.stack([maps[name] for name in START])
 
         def residuals(x):
-            moved = part.moved(PicturedScene(ball, camera(), ()), x, tables)
-            return (
-                linear(moved.splats.weights).ravel() / NOISE,
-                part.prior_residuals(x, tables).ravel(),
-            )
+            moved = part.moved(PicturedScene(ball, camera(), ()), x, tables).splats
+            of_pictures = linear(moved.weights) / NOISE
+            of_prior = part.prior_residuals(x, tables)
+            return jnp.concatenate([of_pictures.ravel(), of_prior.ravel()])
 
         x = fitted.coordinates[0]
-        rows = np.concatenate(
-            [np.asarray(leaf).reshape(-1, x.size) for leaf in jax.jacobian(residuals)(x)]
+        rows, change = (
+            np.asarray(jax.jacobian(function)(x)).reshape(-1, x.size)
+            for function in (residuals, lambda x: stacked(part.maps(x, tables)))
         )
-        change = jax.jacobian(lambda x: stacked(part.maps(x, tables)))(x)
-        change = np.asarray(change).reshape(-1, x.size)
         exact = np.sqrt(np.diag(change @ np.linalg.inv(rows.T @ rows) @ change.T))
         bars = np.std([stacked(draw.maps) for draw in draws], axis=0, ddof=1).ravel()
         ratio = bars / exact
