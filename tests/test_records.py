@@ -247,6 +247,24 @@ def test_traced_values_and_placeholders_pass_through_transformations():
             ),
             r"layers have \[1, 2, 3\] channels",
         ),
+        (
+            lambda: sj.diffusion.ShapeDiffuser(error=0.0),
+            "ShapeDiffuser.error must be .*0",
+        ),
+        (
+            lambda: sj.diffusion.ShapeDiffuser(opening=-0.5),
+            "ShapeDiffuser.opening must be .*-0.5",
+        ),
+        (lambda: sj.splatting.SplattingSettings(full_coverage=0.0), "full_coverage"),
+        (lambda: sj.splatting.SplattingSettings(full_coverage=1.5), "full_coverage"),
+        (
+            lambda: sj.splatting.ShadowSettings(pixels_per_spacing=0.0),
+            "pixels_per_spacing.*positive",
+        ),
+        (
+            lambda: sj.splatting.ShadowSettings(pixels_per_spacing=np.nan),
+            "pixels_per_spacing.*positive",
+        ),
         (lambda: sj.inverse.combined([]), "recoveries is empty"),
         (lambda: sj.inverse.HuberLoss(0.0), "bend must be positive"),
         (

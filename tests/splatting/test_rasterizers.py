@@ -132,8 +132,8 @@ def test_a_picture_is_a_part_of_a_larger_one(float64):
     """Its middle, or beside it with an off-center principal point. Which splats are left out for
     lying beside the picture is common to both rasterizers.
     """
-    border, plan = 20, DenseRasterizer().make_plan([], [], SETTINGS)
-    right, down = 13, -17
+    border, right, down = 20, 13, -17
+    plan = DenseRasterizer().make_plan([], [], SETTINGS)
 
     @jax.jit
     def weights(body, view):
@@ -141,8 +141,9 @@ def test_a_picture_is_a_part_of_a_larger_one(float64):
         middle = jnp.asarray(WIDTH / 2 - right), jnp.asarray(HEIGHT / 2 - down)
         beside = dataclasses.replace(view, principal_pixel=middle)
         nothing = jnp.zeros((0, body.count))
-        views = view, beside, larger
-        drawn = (bodies.drawn(body, nothing, each, SETTINGS, plan) for each in views)
+        drawn = (
+            bodies.drawn(body, nothing, each, SETTINGS, plan) for each in (view, beside, larger)
+        )
         return [(each.front.weight_sum, each.behind.weight_sum) for each in drawn]
 
     for seed in seeds(IN_SUITE):
@@ -161,12 +162,8 @@ def test_too_small_a_capacity_makes_the_picture_nan_and_is_reported():
     whole = TileRasterizer(lanes=2, slots=16).make_plan([body], [view], SETTINGS)
     plan = whole.fitted([body], [view], SETTINGS)
     assert plan.places.behind < whole.places.behind
-    for short in (
-        {},
-        {"splats": 100},
-        {"bins": BinCapacity(1024, 4)},
-        {"places": dataclasses.replace(plan.places, behind=2)},
-    ):
+    few = dataclasses.replace(plan.places, behind=2)
+    for short in ({}, {"splats": 100}, {"bins": BinCapacity(1024, 4)}, {"places": few}):
         tried = dataclasses.replace(plan, **short)
         make = jax.jit(make_shadow_map, static_argnums=(2, 3, 4))
         seen = make(body, view, SETTINGS, tried, DeviceMesh())
@@ -181,9 +178,8 @@ def test_too_small_a_capacity_is_reported(short):
     middle = rng.uniform(-10, 70, (2, count))
     half = np.exp(rng.uniform(np.log(0.1), np.log(30.0), (2, count)))
     half = np.where(rng.uniform(size=half.shape) < 0.05, np.inf, half)
-    (left, top), (right, bottom) = jnp.asarray(middle - half), jnp.asarray(middle + half)
-    visible = jnp.asarray(rng.uniform(size=count) < 0.9)
-    ranges = TileRanges.of(left, right, top, bottom, visible, grid)
+    sides = jnp.asarray(np.stack([middle - half, middle + half], axis=1).reshape(4, count))
+    ranges = TileRanges.of(*sides, jnp.asarray(rng.uniform(size=count) < 0.9), grid)
     capacity = BinCapacity.for_counts([ranges.per_tile(grid)], grid)
     tried = dataclasses.replace(capacity, **short)
     needed = jax.jit(lambda ranges: bin_items(ranges, grid, tried).needed)(ranges)

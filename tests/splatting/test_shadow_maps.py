@@ -68,8 +68,8 @@ def test_the_sphere_around_all_discs_reaches_two_pixels_from_the_edge():
     bounds, centers = bounds_of(body), np.asarray(body.centers, float)
     middle = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
     np.testing.assert_allclose(bounds.center, middle, atol=1e-5)
-    reach = np.linalg.norm(centers - np.asarray(bounds.center), axis=1).max()
-    np.testing.assert_allclose(bounds.radius, reach + float(body.radii.max()), rtol=1e-5)
+    reach = np.linalg.norm(centers - middle, axis=1).max() + float(body.radii.max())
+    np.testing.assert_allclose(bounds.radius, reach, rtol=1e-5)
     on_sphere = bounds.center[:, None] + bounds.radius * jnp.asarray(bodies.directions(20_000).T)
     for view in LIGHTS.values():
         x, y, _ = view(bounds).project(jnp.asarray(on_sphere, float))
@@ -110,10 +110,8 @@ def test_each_surface_blocks_what_reaches_it():
     view = OrthographicView(jnp.zeros(3), jnp.eye(3), jnp.asarray(2.0), size, size)
     planes = jnp.asarray([front, covers, behind, covers_behind])[:, None, None]
     planes = jnp.broadcast_to(planes, (4, (size // TILE_SIDE) ** 2, TILE_SIDE**2))
-    column, depth = (
-        each.reshape(-1)
-        for each in np.meshgrid(np.linspace(-1.7, 34.2, 38), np.linspace(2.9, 6.1, 33))
-    )
+    grid = np.meshgrid(np.linspace(-1.7, 34.2, 38), np.linspace(2.9, 6.1, 33))
+    column, depth = np.reshape(grid, (2, -1))
     row = np.linspace(-0.4, 31.9, column.size)[::-1]
     centers = np.stack([(column - size / 2) / 2, (row - size / 2) / 2, depth], axis=1)
     body = bodies.splats(centers, np.tile([0.0, 0.0, -1.0], (len(depth), 1)), 0.1)
@@ -141,8 +139,7 @@ def test_each_surface_blocks_what_reaches_it():
 def test_umbra_is_dark_and_the_rest_is_lit(kind):
     body, floor = scene()
     view = LIGHTS[kind](bounds_of(body))
-    plan = TileRasterizer(lanes=8, slots=16).make_plan([body], [view], SPLATTING)
-    visible = np.asarray(visibility(body, view, plan))
+    visible = np.asarray(visibility(body, view, plan_for(view, body)))
     middle, radius = np.asarray([0.3, 0.1]) * HEIGHT, RADIUS
     if kind == "near":
         eye = np.asarray(view.position, float)
@@ -163,9 +160,8 @@ def test_the_shadow_of_an_open_edge_ends_within_half_a_spacing():
     spacing, height = 0.25, 5.0
     blocker = bodies.sheet(3.0, spacing, center=(-3.0 - spacing / 2, 0.0, height))  # to x = 0
     line = np.linspace(-2, 2, 161)
-    x, y = (each.reshape(-1) for each in np.meshgrid(line, np.arange(-2.0, 2.0, 0.2)))
-    floor = np.stack([x, y, np.zeros_like(x)], axis=1)
-    floor = bodies.splats(floor, np.tile([0.0, 0.0, 1.0], (len(x), 1)), 1.5 * spacing)
+    floor = np.stack(np.meshgrid(line, np.arange(-2.0, 2.0, 0.2), 0.0), axis=-1).reshape(-1, 3)
+    floor = bodies.splats(floor, np.tile([0.0, 0.0, 1.0], (len(floor), 1)), 1.5 * spacing)
     body, settings = bodies.joined(blocker, floor), ShadowSettings(resolution=256)
     view = distant_view(jnp.asarray([0.0, 0.0, -1.0]), bounds_of(body), settings)
     visible = visibility(body, view, plan_for(view, body), settings)[blocker.count :]
@@ -191,13 +187,6 @@ def test_a_map_no_finer_than_its_splats_shows_the_whole_shadow(scale):
 
 
 @pytest.mark.once
-@pytest.mark.parametrize("number", [0.0, -1.0, np.nan])
-def test_a_map_without_pixels_is_refused(number):
-    refused = "pixels_per_spacing.*positive"
-    bodies.assert_refused(lambda: ShadowSettings(pixels_per_spacing=number), refused)
-
-
-@pytest.mark.once
 @pytest.mark.parametrize("kind", [*LIGHTS, "cube"])
 def test_a_sphere_does_not_shadow_itself(kind):
     """Every splat whose cosine to the light is above 0.2 is lit; the discs' own curvature is a
@@ -205,8 +194,10 @@ def test_a_sphere_does_not_shadow_itself(kind):
     """
     body, toward = bodies.sphere(1500, 10.0), jnp.asarray([0.6, 0.3, 0.742])
     if kind == "cube":  # a point amid splats that face it
-        body = eqx.tree_at(lambda s: s.normals, body, -body.normals)
-        toward = jnp.asarray([0.8, -0.6, 0.4])
+        body, toward = (
+            dataclasses.replace(body, normals=-body.normals),
+            jnp.asarray([0.8, -0.6, 0.4]),
+        )
         views = cube_views(toward, SETTINGS)
     elif kind == "near":
         toward = 80 * toward
@@ -214,14 +205,15 @@ def test_a_sphere_does_not_shadow_itself(kind):
     else:
         views = [distant_view(-toward, bounds_of(body), SETTINGS)]
     plan = TileRasterizer(lanes=8, slots=16).make_plan([body], views, SPLATTING)
-    visible = [np.asarray(visibility(body, view, plan)) for view in views]
-    if kind == "cube":
-        faces = [np.asarray(in_cube_face(view, body.centers.T)) for view in views]
-        visible = [face * each for face, each in zip(faces, visible, strict=True)]
+    visible = sum(
+        np.asarray(visibility(body, view, plan))
+        * np.asarray(kind != "cube" or in_cube_face(view, body.centers.T))
+        for view in views
+    )
     wi = bodies.unit(np.asarray(toward) - (0 if kind == "distant" else np.asarray(body.centers)))
     cosine = np.sum(wi * np.asarray(body.normals, float), axis=1)
-    assert np.min(sum(visible)[cosine > 0.2]) > 0.99
-    assert kind == "cube" or np.max(sum(visible)[cosine < -0.3]) < 0.01
+    assert np.min(visible[cosine > 0.2]) > 0.99
+    assert kind == "cube" or np.max(visible[cosine < -0.3]) < 0.01
 
 
 @pytest.mark.once
@@ -242,17 +234,15 @@ def test_light_that_grazes_a_smooth_body_leaves_no_terraces():
 def test_edge_has_the_gradient_of_central_differences(float64):
     """In the direction of the light, and in where the occluder stands."""
     body, floor = scene()
-    bounds = bounds_of(body)
-    weights = jnp.asarray(np.random.default_rng(3).normal(size=floor))
+    bounds, weights = bounds_of(body), np.random.default_rng(3).normal(size=floor)
     start = jnp.asarray([0.3, 0.1, -1.0]), jnp.asarray([0.05, -0.03, 0.2])
     plan = plan_for(distant_view(start[0], bounds, SETTINGS), body)
 
     @jax.jit
     def total(direction, shift):
-        centers = jnp.concatenate([body.centers[:floor], body.centers[floor:] + shift[None]])
-        moved = eqx.tree_at(lambda s: s.centers, body, centers)
+        moved = dataclasses.replace(body, centers=body.centers.at[floor:].add(shift[None]))
         view = distant_view(direction, bounds, SETTINGS)
-        return jnp.dot(visibility(moved, view, plan)[:floor], weights)
+        return jnp.vdot(visibility(moved, view, plan)[:floor], weights)
 
     check_grads(total, start, 1, ["rev"], atol=1e-5, rtol=1e-5, eps=1e-6)
 
@@ -261,13 +251,11 @@ def test_merged_splats_have_the_area_of_each_side():
     """Two sides of a thin sheet, in one group or another: no disc lies between them."""
     upper = bodies.sheet(3.9, 0.5, center=(0.0, 0.0, 0.1))
     lower = bodies.sheet(3.9, 0.5, normal=(0.0, 0.0, -1.0), center=(0.0, 0.0, -0.1))
-    body = bodies.joined(upper, lower)
-    order = np.random.default_rng(0).permutation(body.count)
-    discs = merge_splats(jax.tree.map(lambda leaf: leaf[order], body), 8)
-    up = np.asarray(discs.normals, float)[:, 2]
-    exists = np.asarray(discs.radii) > 0
+    order = np.random.default_rng(0).permutation(2 * upper.count)
+    discs = merge_splats(bodies.joined(upper, lower).take(jnp.asarray(order)), 8)
+    up = np.asarray(discs.normals)[:, 2]
     np.testing.assert_allclose(np.asarray(discs.centers)[:, 2], 0.1 * up, atol=1e-6)
-    assert np.all(np.abs(up) == exists)
+    np.testing.assert_array_equal(np.abs(up), discs.radii > 0)
     for side, own in ((upper, up > 0), (lower, up < 0)):
         for total in (lambda s: s.areas, lambda s: s.radii**2):
             whole = np.sum(np.asarray(total(discs), float)[own])
