@@ -200,6 +200,20 @@ def assert_close(found, expected, **tolerance) -> None:
         np.testing.assert_allclose(ours, theirs, **tolerance)
 
 
+def assert_gradient(function: Callable, given: tuple, step: float, **tolerance) -> None:
+    """Compare the gradient of a number, in one argument after the other, with central differences
+    along some way.
+    """
+    value_and_gradient = jax.jit(jax.value_and_grad(function, argnums=range(len(given))))
+    _, gradient = value_and_gradient(*given)
+    for i, slope in enumerate(gradient):
+        way = jnp.asarray(np.random.default_rng(i).normal(size=slope.shape), slope.dtype)
+        moved = ((*given[:i], given[i] + by * way, *given[i + 1 :]) for by in (step, -step))
+        ahead, behind = (value_and_gradient(*each)[0] for each in moved)
+        expected = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(jnp.vdot(slope, way), expected, **tolerance)
+
+
 def assert_refused(call: Callable[[], object], message: str) -> None:
     """Check that a call raises an error of bad input with a message, given as a pattern."""
     with pytest.raises(ValueError, match=message):
