@@ -16,18 +16,12 @@ def plane(stretch: float, quads: int = 6, half: float = HALF) -> sj.geometry.Mes
     """A square at z = 0 that faces +z; `stretch` times as many mm along u as along v, its chart in
     the middle of the texture.
     """
-    line = np.linspace(-1.0, 1.0, quads + 1)
-    flat = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    first = (np.arange(quads)[:, None] * (quads + 1) + np.arange(quads)).reshape(-1)
-    step = quads + 1
-    faces = np.concatenate(
-        [
-            np.stack([first, first + 1, first + step + 1], 1),
-            np.stack([first, first + step + 1, first + step], 1),
-        ]
-    )
-    vertices = np.column_stack([half * flat, np.zeros(len(flat))])
-    normals = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
+    line, step = np.linspace(-half, half, quads + 1), quads + 1
+    vertices = np.stack(np.meshgrid(line, line, 0.0), axis=-1).reshape(-1, 3)
+    first = np.arange(step * step).reshape(step, step)[:-1, :-1].reshape(-1)
+    corners = [0, 1, step + 1], [0, step + 1, step]
+    faces = np.concatenate([np.add.outer(first, each) for each in corners])
+    normals = np.tile([0.0, 0.0, 1.0], (len(vertices), 1))
     return sj.geometry.Mesh(vertices, faces, normals, coordinates(vertices, stretch, half)[faces])
 
 
@@ -76,6 +70,5 @@ def gathered(
         sj.diffusion.dense_layer(sources, places, variance, depth)
         for variance, depth in zip(variances, kernel.depths(variances), strict=True)
     ]
-    return jnp.stack([each.values[:-1] for each in layers]), jnp.stack(
-        [each.values[-1] for each in layers]
-    )
+    values = jnp.stack([each.values for each in layers])
+    return values[:, :-1], values[:, -1]

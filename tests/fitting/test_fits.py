@@ -98,8 +98,7 @@ def test_a_fit_reports_its_errors_and_held_energy_is_held_at_little_cost(float64
     near = GivenVariances(1.1 * free.gaussians.variances)
     assert np.all(np.diff(free.gaussians.variances) > 0)
     assert bool(free.result == optx.RESULTS.successful)
-    eq_4 = relative_error(profile, free.gaussians)
-    np.testing.assert_allclose(eq_4, free.error, rtol=1e-9)
+    np.testing.assert_allclose(relative_error(profile, free.gaussians), free.error, rtol=1e-9)
     energy_error = free.gaussians.total_reflectance() / profile.total_reflectance() - 1
     np.testing.assert_allclose(free.energy_error, energy_error, atol=1e-12)
     held = fit_gaussians(profile, 4, weights=FixedTotalReflectance(), start=near)
@@ -122,12 +121,9 @@ def test_a_fit_reports_its_errors_and_held_energy_is_held_at_little_cost(float64
     variances, weights = [0.0363, 0.1461, 0.9114, 7.010], [0.0704, 0.1839, 0.2060, 0.2882]
     published = sj.SumOfGaussians(variances, np.repeat(np.c_[weights], 3, axis=1))
     assert_close(green.gaussians, published, rtol=PUBLISHED)
-    np.testing.assert_allclose(
-        own.gaussians.variances[1], green.gaussians.variances, rtol=SAME_OPTIMUM
-    )
-    np.testing.assert_allclose(
-        own.gaussians.weights[1, :, 0], green.gaussians.weights[:, 1], rtol=SAME_OPTIMUM
-    )
+    alone = green.gaussians.variances, green.gaussians.weights[:, 1]
+    ours = own.gaussians.variances[1], own.gaussians.weights[1, :, 0]
+    assert_close(ours, alone, rtol=SAME_OPTIMUM)
     # Nothing depends on the unit of length.
     medium = profile.medium
     in_cm = Medium(medium.sigma_a * 10, medium.sigma_s_prime * 10, medium.eta)
@@ -220,11 +216,9 @@ def test_float32_reaches_its_floor_and_calls_it_success():
 
 
 def test_the_search_says_when_it_gave_up(float64, monkeypatch):
-    profile = media("skin2")
-    problem = make_problem(profile, FreeWeights(), L2_QUADRATURE)
+    problem, start = make_problem(media("skin2"), FreeWeights(), L2_QUADRATURE), [-1.0, 2.0]
     monkeypatch.setattr(_search, "_NEWTON_STEPS", 0)
-    start = jnp.asarray([-1.0, 2.0])
-    unmoved, converged = refine(problem, start)
+    unmoved, converged = refine(problem, jnp.asarray(start))
     np.testing.assert_array_equal(unmoved, start)
     assert not bool(converged)
 
@@ -256,5 +250,4 @@ def test_a_material_of_a_medium_is_the_one_in_the_library(float64):
     marble = sj.load_material("marble")
     surface = {"specular": marble.specular, "roughness": marble.roughness}
     made = sj.Material.of_medium(sj.load_medium("marble"), **surface)
-    for found, expected in zip(jax.tree.leaves(made), jax.tree.leaves(marble), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+    assert_close(made, marble, rtol=1e-4, atol=1e-6)

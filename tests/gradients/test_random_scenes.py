@@ -213,12 +213,14 @@ def typical(shape: Shape) -> World:
         return jnp.ones(sizes, shape.precision)
 
     def light(letter: str):
-        if letter in "ds":
-            return sj.DirectionalLight(-ones(3), ones(channels), cast_shadows=letter == "s")
-        if letter == "b":
-            return sj.GaussianBeam(ones(3), -ones(3), ones(channels), ones())
-        place = (0 if letter == "c" else 100) * ones(3)
-        return sj.PointLight(place, ones(channels), cast_shadows=letter != "p")
+        match letter:
+            case "d" | "s":
+                return sj.DirectionalLight(-ones(3), ones(channels), cast_shadows=letter == "s")
+            case "b":
+                return sj.GaussianBeam(ones(3), -ones(3), ones(channels), ones())
+            case _:
+                place = (0 if letter == "c" else 100) * ones(3)
+                return sj.PointLight(place, ones(channels), cast_shadows=letter != "p")
 
     centers = np.random.default_rng(count).uniform(-5, 5, (count, 3))
     centers = jnp.asarray(centers, shape.precision)

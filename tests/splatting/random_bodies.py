@@ -80,7 +80,6 @@ def disagreement(found, expected) -> float:
 
     So a number that is far larger than the others hides nothing. NaN where anything is.
     """
-    found, expected = np.asarray(found), np.asarray(expected)
     size = np.abs(expected)
     typical = np.median(size[size > 0]) if np.any(size > 0) else 1.0
     return float(np.max(np.abs(found - expected) / (size + typical), initial=0.0))
@@ -97,31 +96,31 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: sj.splatting.A
     depth = np.exp(rng.uniform(np.log(4.0), np.log(rng.choice([5.0, 40.0])), count))
     size = np.exp(rng.uniform(np.log(0.6), np.log(6.0), count))  # radius in pixels
     steepest = rng.choice([0.3, 1.0, 5.0])
-    if kind == "larger than the picture":
-        size = np.exp(rng.uniform(0, 3, count)) * width
-    if kind == "tiny":
-        size = 10 ** rng.uniform(-3, -0.5, count)
-    if kind == "behind":
-        depth = -depth
-    if kind in ("off screen", "none is seen"):
-        away = rng.uniform(1, 40, count) * width
-        x = np.where(rng.uniform(size=count) < 0.5, -away, width + away)
-    if kind == "off screen":
-        size = np.where(
-            rng.uniform(size=count) < 0.5, size, away * rng.uniform(0.8, 2.0, count)
-        )  # some reach into the picture
-    if kind == "at the border":
-        x = rng.choice([0.0, width], count) + rng.uniform(-1.5, 1.5, count) * size
-    if kind == "through the near plane":
-        depth = NEAR * np.exp(rng.uniform(-1, 5, count))
-        size = np.exp(rng.uniform(0, 6, count))
-    if kind == "in one tile":
-        x, y = rng.uniform(8.2, 15.8, (2, count))
-        size = rng.uniform(0.3, 2, count)
-    if kind == "in one place":
-        x, y, depth = (np.repeat(each[:1], count) for each in (x, y, depth))
-    if kind == "two sheets":
-        depth, size = np.full(count, depth[0]), rng.uniform(2, 6, count)
+    match kind:
+        case "larger than the picture":
+            size = np.exp(rng.uniform(0, 3, count)) * width
+        case "tiny":
+            size = 10 ** rng.uniform(-3, -0.5, count)
+        case "behind":
+            depth = -depth
+        case "off screen" | "none is seen":
+            away = rng.uniform(1, 40, count) * width
+            x = np.where(rng.uniform(size=count) < 0.5, -away, width + away)
+            if kind == "off screen":  # some reach into the picture
+                reach = away * rng.uniform(0.8, 2.0, count)
+                size = np.where(rng.uniform(size=count) < 0.5, size, reach)
+        case "at the border":
+            x = rng.choice([0.0, width], count) + rng.uniform(-1.5, 1.5, count) * size
+        case "through the near plane":
+            depth = NEAR * np.exp(rng.uniform(-1, 5, count))
+            size = np.exp(rng.uniform(0, 6, count))
+        case "in one tile":
+            x, y = rng.uniform(8.2, 15.8, (2, count))
+            size = rng.uniform(0.3, 2, count)
+        case "in one place":
+            x, y, depth = (np.repeat(each[:1], count) for each in (x, y, depth))
+        case "two sheets":
+            depth, size = np.full(count, depth[0]), rng.uniform(2, 6, count)
     mm = depth / pixels if perspective else np.full_like(depth, 1 / pixels)  # of a pixel
     across = np.stack([x - width / 2, y - height / 2]) * mm
     position, axes = np.asarray(seen.position, float), np.asarray(seen.rotation, float)
@@ -134,24 +133,24 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: sj.splatting.A
     if kind == "in one place" and rng.uniform() < 0.5:
         across, slope, size = (np.repeat(each[:1], count, axis=0) for each in (across, slope, size))
     normals = -rays + slope[:, None] * across
-    if kind == "facing away":
-        normals = -normals
-    if kind == "edge on":
-        normals = across
-    if kind == "nearly edge on":
-        normals = (
-            across - rays * (rng.choice([-1, 1], count) * 10 ** rng.uniform(-9, -1, count))[:, None]
-        )
-    normals = bodies.unit(normals)
-    radii = size * np.abs(mm)
-    if kind == "two sheets":
-        settings = sj.splatting.SplattingSettings()
-        radii = np.full(count, radii[0])
-        normals = -rays
-        reach = np.hypot(radii, settings.filter_radius * mm)
-        apart = settings.epsilon_z * reach * rng.choice([0.5, 0.97, 1.03, 2.5])
-        places += np.where(np.arange(count) % 2, apart, 0)[:, None] * rays
-    if kind == "alone":
-        hidden = np.arange(count) != rng.integers(count)
-        normals = np.where(hidden[:, None], rays, normals)
+    match kind:
+        case "facing away":
+            normals = -normals
+        case "edge on":
+            normals = across
+        case "nearly edge on":
+            slant = rng.choice([-1, 1], count) * 10 ** rng.uniform(-9, -1, count)
+            normals = across - rays * slant[:, None]
+    normals, radii = bodies.unit(normals), size * np.abs(mm)
+    match kind:
+        case "two sheets":
+            settings = sj.splatting.SplattingSettings()
+            radii = np.full(count, radii[0])
+            normals = -rays
+            reach = np.hypot(radii, settings.filter_radius * mm)
+            apart = settings.epsilon_z * reach * rng.choice([0.5, 0.97, 1.03, 2.5])
+            places += np.where(np.arange(count) % 2, apart, 0)[:, None] * rays
+        case "alone":
+            hidden = np.arange(count) != rng.integers(count)
+            normals = np.where(hidden[:, None], rays, normals)
     return places, normals, radii

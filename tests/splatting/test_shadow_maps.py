@@ -252,7 +252,8 @@ def test_merged_splats_have_the_area_of_each_side():
     upper = bodies.sheet(3.9, 0.5, center=(0.0, 0.0, 0.1))
     lower = bodies.sheet(3.9, 0.5, normal=(0.0, 0.0, -1.0), center=(0.0, 0.0, -0.1))
     order = np.random.default_rng(0).permutation(2 * upper.count)
-    discs = merge_splats(bodies.joined(upper, lower).take(jnp.asarray(order)), 8)
+    body = jax.tree.map(lambda leaf: leaf[order], bodies.joined(upper, lower))
+    discs = merge_splats(body, 8)
     up = np.asarray(discs.normals)[:, 2]
     np.testing.assert_allclose(np.asarray(discs.centers)[:, 2], 0.1 * up, atol=1e-6)
     np.testing.assert_array_equal(np.abs(up), discs.radii > 0)
