@@ -101,8 +101,9 @@ def test_constant_light_stays_constant_and_does_not_jump_to_another_surface(kern
     right, corner = x >= SIZE // 2, x + y < 20
     lit = ~right & ~corner
     frame = flat(np.repeat(lit[..., None], 3, axis=2))
-    depth = np.where(corner, np.inf, frame.depth + 100 * right)
-    frame = dataclasses.replace(frame, depth=depth, coverage=np.where(corner, 0.0, 1.0))
+    depth = np.where(corner, np.inf, np.asarray(frame.depth) + 100 * right)
+    depth, coverage = (jnp.asarray(each, float) for each in (depth, ~corner))
+    frame = dataclasses.replace(frame, depth=depth, coverage=coverage)
     found = np.asarray(exitance(frame, TWO, kernel))
     np.testing.assert_allclose(found[lit], 1.0, rtol=1e-5)
     np.testing.assert_allclose(found[~lit], 0.0, atol=1e-6)
