@@ -265,15 +265,18 @@ def test_irradiance_is_the_sum_of_the_formulas(count, float32):
     away, offset = PLACE - centers, centers - ORIGIN
     across = offset - np.sum(offset * unit(AXIS), axis=1, keepdims=True) * unit(AXIS)
     beam = np.exp(-np.sum(across**2, axis=1) / 18) / (18 * np.pi)
-    expected = np.outer(STRENGTHS[0], received(-unit(DIRECTIONS[0])) * shares[0])
-    expected += np.outer(STRENGTHS[3], received(-unit(AXIS)) * beam)
     point = received(unit(away)) / np.sum(away**2, axis=1)
-    expected += np.outer(STRENGTHS[2], point * shares[2])
-    expected += np.outer(STRENGTHS[1], received(-unit(DIRECTIONS[1])) * shares[3])
     inner, outer = np.cos(np.radians([5, 15]))
     t = np.clip((unit(away) @ unit(PLACE) - outer) / (inner - outer), 0, 1)
     assert (np.min(t), np.max(t)) == (0, 1)
-    expected += np.outer(STRENGTHS[2], point * (3 * t**2 - 2 * t**3) * shares[4])
+    arriving = [
+        received(-unit(DIRECTIONS[0])) * shares[0],
+        received(-unit(AXIS)) * beam,
+        point * shares[2],
+        received(-unit(DIRECTIONS[1])) * shares[3],
+        point * (3 * t**2 - 2 * t**3) * shares[4],
+    ]
+    expected = STRENGTHS[[0, 3, 2, 1, 2]].T @ arriving
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 
 
