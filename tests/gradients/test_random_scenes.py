@@ -258,7 +258,8 @@ def is_finite(shape: Shape, world: World, factors=1.0) -> bool:
     loss, gradient = loss_and_gradient(shape)(world, factors)
     wrong = [name for name, leaf in named(gradient).items() if not np.all(np.isfinite(leaf))]
     shown = eqx.tree_pformat(world, short_arrays=False) if wrong else ""
-    assert not (np.isfinite(loss) and wrong), f"loss {loss:g}: {wrong} not finite, {shown}"
+    message = f"the gradient of a loss of {float(loss):g} is not finite in {wrong}, {shown}"
+    assert not (np.isfinite(loss) and wrong), message
     return bool(np.isfinite(loss))
 
 
