@@ -107,8 +107,8 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: sj.splatting.A
             away = rng.uniform(1, 40, count) * width
             x = np.where(rng.uniform(size=count) < 0.5, -away, width + away)
             if kind == "off screen":  # some reach into the picture
-                reach = away * rng.uniform(0.8, 2.0, count)
-                size = np.where(rng.uniform(size=count) < 0.5, size, reach)
+                keeps_size = rng.uniform(size=count) < 0.5
+                size = np.where(keeps_size, size, away * rng.uniform(0.8, 2.0, count))
         case "at the border":
             x = rng.choice([0.0, width], count) + rng.uniform(-1.5, 1.5, count) * size
         case "through the near plane":
