@@ -80,6 +80,7 @@ def disagreement(found, expected) -> float:
 
     So a number that is far larger than the others hides nothing. NaN where anything is.
     """
+    found, expected = np.asarray(found), np.asarray(expected)
     size = np.abs(expected)
     typical = np.median(size[size > 0]) if np.any(size > 0) else 1.0
     return float(np.max(np.abs(found - expected) / (size + typical), initial=0.0))
