@@ -256,7 +256,7 @@ def test_traced_values_and_placeholders_pass_through_transformations():
             "ShapeDiffuser.opening must be .*-0.5",
         ),
         (lambda: sj.splatting.SplattingSettings(full_coverage=0.0), "full_coverage"),
-        (lambda: sj.splatting.SplattingSettings(full_coverage=1.5), "full_coverage"),
+        (lambda: sj.splatting.SplattingSettings(full_coverage=-1.0), "full_coverage"),
         (
             lambda: sj.splatting.ShadowSettings(pixels_per_spacing=0.0),
             "pixels_per_spacing.*positive",

@@ -26,8 +26,8 @@ from splatjax.diffusion import PlainMean, ShapeDiffuser
 from splatjax.geometry import Mesh, bust_mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
 
-SIZE = 128  # pixels along a side
-SAMPLES, PASSES = 128, 4  # paths per pixel of a pass, and passes
+# Pixels along a side, paths per pixel of a pass, and passes.
+SIZE, SAMPLES, PASSES = 128, 128, 4
 ALBEDO = (0.9, 0.98, 0.998)
 SIGMA_T = 1.0  # 1/mm; isotropic scattering
 IRRADIANCE = float(np.pi)
