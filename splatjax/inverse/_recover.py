@@ -172,7 +172,7 @@ def recover(
             pictures, residuals = compared(radiance, problem.counted, evidence)
             best = Recovery(
                 medium=unknowns.medium(point),
-                material=surface.surface_of(gaussians, model.angles(medium)),
+                material=surface.surface_of(gaussians, model.angles(unknowns.medium(point))),
                 intensities=unknowns.intensities(point),
                 information=information,
                 unresolved=unresolved,

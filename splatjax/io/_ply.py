@@ -1,5 +1,6 @@
 """Splats in PLY files, read at once or, for files that are larger than memory, part by part."""
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -256,11 +257,14 @@ def _splat_fields(
     )
     if factors:
         shape = factors[-1][0]
-        if [place for place, _ in factors] != [(k + 1, c + 1) for k, c in np.ndindex(shape)]:
-            raise ValueError(
-                f"{path}: its vertices have {', '.join(name for _, name in factors)}, and not one "
-                "for each Gaussian and channel: write all of them"
-            )
+        places = [place for place, _ in factors]
+        as_many = len(places) == math.prod(shape)
+        require(
+            as_many and places == [(k + 1, c + 1) for k, c in np.ndindex(shape)],
+            path,
+            f"its vertices have {', '.join(name for _, name in factors)}, and not one for each "
+            "Gaussian and channel: write all of them",
+        )
         fields["weights"] = _values(
             path, "weights", {name: single[name] for _, name in factors}, 1.0
         ).reshape(-1, *shape)

@@ -17,6 +17,7 @@ from ._rasterizer import (
     PixelSums,
     fragment_weight,
     least_weight,
+    may_show_behind,
 )
 from ._views import AbstractView, SplattingSettings
 
@@ -74,16 +75,16 @@ class DenseRasterPlan(AbstractRasterPlan):
             # The front: fragments nearer than the nearest shifted one.
             front = inside & (nearness > nearest(inside)[:, None])
             in_front = summed(front)
-            # Behind it, in pixels that it leaves open: the same among all others, from the nearest
-            # that weighs something.
-            is_open = jax.lax.stop_gradient(in_front[-1]) < settings.hidden_from
-            behind = inside & ~front & is_open[:, None]
+            # Behind it: the same among all others, from the nearest that weighs something.
+            behind = inside & ~front
             weighty = nearest(behind & (weight > least))
             limit = jnp.where(weighty > -jnp.inf, weighty, nearest(behind))
             return in_front, summed(behind & (nearness > limit[:, None]))
 
         surfaces = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
-        rows = jnp.concatenate([grid.cut(surface.transpose(1, 0, 2)) for surface in surfaces])
+        front, behind = (grid.cut(surface.transpose(1, 0, 2)) for surface in surfaces)
+        is_open = may_show_behind(front[:, -1], grid, settings.hidden_from)
+        rows = jnp.concatenate([front, jnp.where(is_open[:, None], behind, 0.0)])
         tiles = jnp.tile(jnp.arange(grid.count, dtype=jnp.int32), 2)
         sums = PixelSums(rows[:, :-1], rows[:, -1])
         return FragmentSums(tiles, sums, jnp.zeros((), dtype), grid.count)

@@ -8,12 +8,14 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._combination import AbstractCombination
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats
 
+from ._grid import TileGrid
 from ._views import CLOSED, AbstractView, SplattingSettings
 
 _AT_RIM = math.exp(-4.0)
@@ -74,6 +76,18 @@ def coverage(
     weights, 1 from `full` on.
     """
     return smooth_step(weight_sum, 0, full)
+
+
+def may_show_behind(
+    weights: Float[Array, "tiles pixels"], grid: TileGrid, hidden_from: Float[Array, ""]
+) -> Bool[Array, "tiles pixels"]:
+    """Mark the pixels in which the surface behind the front may be seen, by the sums of weights of
+    the front: below `hidden_from` in a tile with a pixel that the front leaves open, and in the
+    tiles around it, which contain all pixels beside the background; elsewhere below `CLOSED`.
+    """
+    has_open = jnp.any(weights < CLOSED, axis=1).reshape(grid.down, grid.across)
+    near = lax.reduce_window(has_open, False, lax.bitwise_or, (3, 3), (1, 1), "SAME").reshape(-1)
+    return weights < jnp.where(near, hidden_from, CLOSED)[:, None]
 
 
 LEAST_WEIGHT = 0.06  # of a fragment that decides where the surface behind the front is

@@ -29,7 +29,7 @@ from splatjax._precision import full_precision
 from ._bins import Bins
 from ._fragments import NUMBERS, PartSweep, SweepSettings
 from ._grid import TILE_SIDE, TileGrid
-from ._rasterizer import FragmentSums, PixelSums, SurfaceCapacity
+from ._rasterizer import FragmentSums, PixelSums, SurfaceCapacity, may_show_behind
 
 
 class Spans(eqx.Module):
@@ -150,7 +150,7 @@ def sum_parts(
     sums = combination.fold(add_front, sums, parts())
     # Stage 3: the end of the surface behind, in pixels that the front leaves open.
     weights = combination.total([[sums[k].weights[: capacities[k].front] for k in views]])
-    is_open = [weights[k] < first[k].hidden_from for k in views]
+    is_open = [_open_pixels(weights[k], fronts[k].tiles, first[k]) for k in views]
     tiles, near_limits, behind_needed = zip(
         *(fronts[k].opened(is_open[k], capacities[k].behind, first[k].grid.count) for k in views),
         strict=True,
@@ -197,6 +197,15 @@ def _empty_sums(part: PartSweep, front: Spans, capacity: SurfaceCapacity) -> Pix
     shape, dtype = (part.attributes.shape[1] + 1, TILE_SIDE**2), front.far_limit.dtype
     rows = zeros_after(inputs, (places, *shape), dtype)
     return PixelSums(rows, zeros_after(inputs, (places, TILE_SIDE**2), dtype))
+
+
+def _open_pixels(
+    weights: Float[Array, "places pixels"], tiles: Int[Array, " places"], part: PartSweep
+) -> Bool[Array, "places pixels"]:
+    """Mark the pixels in which the surface behind may be seen; tiles without a front are open."""
+    of_tiles = jnp.zeros((part.grid.count, TILE_SIDE**2), weights.dtype)
+    of_tiles = of_tiles.at[tiles].set(weights, mode="drop")
+    return _taken(may_show_behind(of_tiles, part.grid, part.hidden_from), tiles, False)
 
 
 @jit_unless_traced

@@ -31,7 +31,6 @@ CLOSED = 0.15
 # Unevenness of even and of scattered splats, and the fraction of their mean weight sum that covers
 # a pixel.
 _UNEVENNESS, _FRACTIONS = (0.1, 0.35), (0.9, 0.11)
-_HIDDEN = 0.8  # of that sum: a front of this weight covers nine tenths of its pixel
 _MEAN_WEIGHT = (1 - 13 * math.exp(-4)) / 4  # `fragment_weight` over a disc
 
 
@@ -67,8 +66,10 @@ class SplattingSettings(eqx.Module):
 
     @property
     def hidden_from(self) -> Float[Array, ""]:
-        """The weight sum of a front from which on what lies behind it is not drawn."""
-        return jnp.maximum(_HIDDEN * jnp.asarray(self.covered_from), CLOSED)
+        """The weight sum of a front from which on nothing is seen behind it, beside the background
+        too.
+        """
+        return jnp.maximum(jnp.asarray(self.covered_from), CLOSED)
 
     def measured(
         self, unevenness: Float[Array, ""], discs: Float[Array, ""]

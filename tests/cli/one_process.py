@@ -1,5 +1,5 @@
-"""`splatjax` with plain renderers, as test_processes.py starts it several times over; killed where
-at a given moment.
+"""`splatjax` with plain renderers, which tests start several times over and may kill at a given
+moment.
 """
 
 import os

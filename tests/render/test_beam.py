@@ -22,9 +22,7 @@ WIDE_TOLERANCE = 0.045  # with clusters; 0.038 measured, where the light is a hu
 
 
 def sheet(spacing: float, half_width: float, kind: str = "grid") -> sj.Splats:
-    """A flat sheet at z = 0 that faces +z; a splat at the origin. Areas are exact but for
-    `jittered`, where they are the mean.
-    """
+    """A flat sheet at z = 0 that faces +z; a splat at the origin. Areas are exact."""
     count = round(half_width / spacing)
     line = np.arange(-count, count + 1) * spacing
     points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)

@@ -27,6 +27,7 @@ from splatjax.splatting import (
     bin_items,
     make_shadow_map,
 )
+from splatjax.splatting._rasterizer import may_show_behind
 
 WIDTH, HEIGHT = 21, 18
 IN_SUITE = 45
@@ -85,10 +86,11 @@ def by_both(count: int, perspective: bool):
     return jax.jit(lambda body, view: [evaluate(plan, body, view) for plan in plans])
 
 
-def open_tiles(weight_sum: jax.Array, full: float) -> int:
-    gaps = (weight_sum > 0) & (weight_sum < full)
-    tiles = TileGrid(WIDTH, HEIGHT).cut(gaps[None].astype(float))
-    return int(jnp.sum(jnp.any(tiles > 0, axis=(1, 2))))
+def open_tiles(weight_sum: jax.Array) -> int:
+    grid = TileGrid(WIDTH, HEIGHT)
+    weights = grid.cut(weight_sum[None])[:, 0]
+    gaps = (weights > 0) & may_show_behind(weights, grid, SETTINGS.hidden_from)
+    return int(jnp.sum(jnp.any(gaps, axis=1)))
 
 
 def compare(count: int, perspective: bool, off, bounds: tuple[float, float]) -> None:
@@ -99,7 +101,7 @@ def compare(count: int, perspective: bool, off, bounds: tuple[float, float]) -> 
         assert float(needed) <= 1
         weights = plain[0]["front weights"]
         behind += int(jnp.sum(plain[0]["behind weights"] > 0))
-        most_open = max(most_open, open_tiles(weights, float(SETTINGS.hidden_from)))
+        most_open = max(most_open, open_tiles(weights))
         assert seed >= len(KINDS) or KINDS[seed] not in UNSEEN or not np.any(weights)
         for bound, ours, theirs in zip(bounds, fast, plain, strict=True):
             for name, expected in theirs.items():
