@@ -119,8 +119,8 @@ class Export:
         if save is not None:
             if not is_scene(Path(self.source)):
                 raise ValueError(
-                    f"{self.output} is of a scene, and {self.source} is not; give the TOML file of "
-                    "a scene, or a picture of `splatjax render`"
+                    f"{self.output} stores a scene, but {self.source} is a material; give the TOML "
+                    "file of a scene, or a picture of `splatjax render`"
                 )
             with stage(f"loading {self.source}"):
                 scene, camera, _ = sj.io.load_scene(self.source)

@@ -80,8 +80,8 @@ def save_gltf(
             if type(light) not in _KINDS
         )
         warnings.warn(
-            f"{path}: glTF has no lights of this kind, and is written without {lost}; write USD, "
-            "or give directional, point and spot lights",
+            f"{path}: glTF cannot store {lost}, so the file lacks them; write USD, or give "
+            "directional, point and spot lights",
             stacklevel=2,
         )
 

@@ -171,7 +171,7 @@ class _Folder:
             if not name.strip().lower().endswith((".mtl", ".bin")):
                 Image.open(BytesIO(data)).close()
         except Exception:  # each decoder fails in its own way
-            self.faults.append(f"names {name!r}, which is not beside it, or no picture")
+            self.faults.append(f"names {name!r}, which is missing beside it, or is not a picture")
             raise
         return data
 

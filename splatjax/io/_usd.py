@@ -233,7 +233,7 @@ def _light(path: Path, number: int, light: AbstractLight) -> str:
             entries["token inputs:texture:format"] = '"latlong"'
         case _:
             warnings.warn(
-                f"{path}: USD has no {kind}, and is written without it; give another light",
+                f"{path}: USD cannot store a {kind}, so the file lacks it; give another light",
                 stacklevel=4,
             )
             return ""

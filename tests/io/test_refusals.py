@@ -317,7 +317,7 @@ def test_textures_are_taken_from_the_files_own_folder_alone(tmp_path):
     rows = "".join(f"vt {u} {v}\n" for u, v in ((0, 0), (1, 0), (1, 1), (0, 1)))
     faces = "".join("f {0}/{0} {1}/{1} {2}/{2}\n".format(*face + 1) for face in TRIANGLES)
     path = write_any(inner / "a.obj", f"mtllib coat.mtl\n{ROWS}{rows}usemtl cloth\n{faces}")
-    coat, outside = "newmtl cloth\nmap_Kd {}\n", r"a\.obj: names .*secret.png', which is not beside"
+    coat, outside = "newmtl cloth\nmap_Kd {}\n", r"a\.obj: names .*secret.png', which is missing"
     for name, text, message in (
         ("coat.mtl", coat.format("../secret.png"), outside),
         ("coat.mtl", coat.format("C:\\maps\\secret.png"), outside),
@@ -330,7 +330,7 @@ def test_textures_are_taken_from_the_files_own_folder_alone(tmp_path):
     Image.new("RGB", (2, 2), (0, 255, 0)).save(inner / "secret.png")
     np.testing.assert_allclose(read(path)[1].albedo[0, 0], [0, 1, 0])
     (inner / "coat.mtl").unlink()
-    with pytest.warns(UserWarning, match=r"'coat.mtl', which is not beside it"):
+    with pytest.warns(UserWarning, match=r"'coat.mtl', which is missing"):
         assert read(path)[1].albedo is None
 
 
