@@ -86,6 +86,17 @@ def jax_settings():
     compilation_cache.reset_cache()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_programs():
+    """Forget compiled programs before XLA crashes: each maps memory, and Linux allows a process
+    65,530 maps.
+    """
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > 30_000:
+        jax.clear_caches()
+
+
 @pytest.fixture
 def monte_carlo():
     """Read a run of the public Monte Carlo code, of tests marked `shared`."""

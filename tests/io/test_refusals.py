@@ -322,7 +322,7 @@ def test_textures_are_taken_from_the_files_own_folder_alone(tmp_path):
         ("coat.mtl", coat.format("../secret.png"), outside),
         ("coat.mtl", coat.format("C:\\maps\\secret.png"), outside),
         ("coat.mtl", coat.format(tmp_path / "secret.png"), outside),
-        ("secret.png", "no picture", "or no picture"),
+        ("secret.png", "no picture", "is not a picture"),
     ):
         (inner / name).write_text(text)
         with pytest.warns(UserWarning, match=message):
