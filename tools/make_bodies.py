@@ -83,7 +83,9 @@ FROM_SPHERE = (0, 0, 80), (0, 0, 0), 18, 150_000
 FROM_SHEET = (30, 20, 80), (0, 0, -1), 30, 150_000
 FROM_HEAD = (250, 100, 800), (0, 70, 0), 19, 683_549
 BUST, FROM_BUST = "the built-in bust", ((250, 0, 800), (0, -40, 0), 22, 300_000)
+EAR = (450, 80, 300), (60, 60, 0), 9, 683_549
 STUDIO = sj.EnvironmentLight(sj.scene.studio())
+BEHIND = sj.EnvironmentLight(np.roll(sj.scene.studio(), len(sj.scene.studio()), axis=1))
 BODIES = [
     Body("sphere", f"{SPHERE}, lit from the side", sphere, lamp(-1, -1, -1), *FROM_SPHERE),
     Body("sphere_studio", f"{SPHERE} in the studio", sphere, STUDIO, *FROM_SPHERE),
@@ -121,7 +123,33 @@ BODIES = [
             lamp(0, 0, 1),
             *FROM_SHEET,
         )
+        for depth in (1, 2, 4, 8)
+    ),
+    *(
+        Body(
+            f"sheet{depth}_front",
+            f"sheet of 40 x 40 x {depth}, lit from the front",
+            functools.partial(box, depth),
+            lamp(0, 0, -1),
+            *FROM_SHEET,
+        )
         for depth in (2, 4, 8)
+    ),
+    Body(
+        "sheet4_refracting",
+        "sheet of 40 x 40 x 4 before the studio, eta 1.4",
+        functools.partial(box, 4),
+        BEHIND,
+        *FROM_SHEET,
+        eta=1.4,
+    ),
+    Body(
+        "block_refracting",
+        "block of 40 x 40 x 20 in the studio, eta 1.4",
+        functools.partial(box, 20),
+        STUDIO,
+        *((0, 70, 40), (0, 0, -5), 32, 200_000),
+        eta=1.4,
     ),
     Body("head", f"{HEAD}, lit from the front", head, lamp(-0.7, -0.5, -1), *FROM_HEAD),
     Body("head_studio", f"{HEAD} in the studio", head, STUDIO, *FROM_HEAD),
@@ -142,22 +170,21 @@ BODIES = [
         sj.scene.RectangleLight.facing([250, 180, 350], [0, -30, 0], 300, 300, [10.0] * 3),
         *FROM_BUST,
     ),
+    Body("ear", f"ear of the {HEAD}, lit from behind", head, lamp(-0.45, -0.25, 1), *EAR),
     Body(
-        "ear",
-        "its ear, lit from behind",
+        "ear_refracting",
+        f"ear of the {HEAD} before the studio, eta 1.4",
         head,
-        lamp(-0.45, -0.25, 1),
-        (450, 80, 300),
-        (60, 60, 0),
-        9,
-        683_549,
+        BEHIND,
+        *EAR,
+        eta=1.4,
     ),
 ]
 
 # A frame of the solved head takes one to two minutes.
 UNSOLVED = (
     *("head_studio", "head_refracting", "head_softbox"),
-    *("bust", "bust_studio", "bust_softbox"),
+    *("bust", "bust_studio", "bust_softbox", "ear_refracting"),
 )
 PICTURED = "sphere", "sphere_refracting", "sheet4", "head", "head_refracting"
 PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"

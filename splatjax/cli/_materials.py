@@ -216,7 +216,7 @@ class Sample:
             metavar="{True,False}",
             help="Whether v = 0 is the lower edge of a map. By default as the format "
             "prescribes: OBJ yes, glTF and GLB no. If the texture is upside down, give "
-            "True.",
+            "the opposite.",
             help_behavior_hint="",
         ),
     ] = None

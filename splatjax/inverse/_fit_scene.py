@@ -127,11 +127,11 @@ def fit_scene(
     Each part has unbounded coordinates in units of its step. The optimizer works on these, so that
     one learning rate serves all parts. The fit minimizes
 
-        sum_pixels loss((rendered - observed) / deviation) + sum_coordinates (moved / expected)^2
+        sum_pixels loss((rendered - observed) / noise) + sum_coordinates (change / deviation)^2
 
-    divided by the number of pixel values that count. The second sum runs over the parts that have a
-    prior. Nothing is compiled between steps. If the scene exceeds the capacity of its plan, a new
-    plan is made.
+    divided by the number of pixel values that count. The `noise` is `Observation.deviation`. The
+    second sum is the prior of the parts that have a `deviation`. Nothing is compiled between steps.
+    If the scene exceeds the capacity of its plan, a new plan is made.
 
     **Arguments:**
 

@@ -100,7 +100,7 @@ def recover(
       non-negative and with a fixed sum, as in the library.
     - `loss`: `SquaredLoss()`, or `HuberLoss()` where the model does not explain some pixels.
     - `settings`: settings of the renderer. By default the layers are eight times more accurate than
-      in `render`: 0.1% of a picture of a bright material is 2% of its absorption.
+      in `render`: an error of 0.1% in a picture of a bright material is one of 2% in absorption.
     - `progress`: called with a description of each stage, and the best medium so far.
 
     **Returns:** a `Recovery` in JAX's default precision: `jax.enable_x64` resolves small errors,

@@ -156,14 +156,17 @@ _MOST = 0.8
 class Recovery(AbstractEstimate):
     r"""The most likely material, and how well the pictures determine it.
 
+        print(recovery.summary())  # coefficients, error bars, and what is not determined
+        of_sigma_a, of_sigma_s_prime = recovery.relative_errors()  # standard deviations
+
     **Attributes:**
 
     - `medium`: its coefficients, 1/mm.
     - `material`: its Gaussians, with the known surface.
     - `intensities`: factors on the light of each picture; 1 where the light was known.
-    - `information`: inverse of the covariance due to the given noise. The unknowns are the
-      logarithms of `sigma_a`, channel by channel, of `sigma_s_prime`, of the unknown factors on the
-      light, and, channel by channel, of the width below which the splats do not resolve a layer.
+    - `information`: inverse of the covariance due to the given noise. Its rows are logarithms: of
+      `sigma_a` of each channel, of `sigma_s_prime` of each channel, of the unknown factors on the
+      light, and of the width below which the splats do not resolve a layer, for each channel.
     - `unresolved`: the fraction of the light of each channel that spreads less than the spacing of
       the splats. A picture determines how much light this is, not how far it travels.
     - `chi_squared`: sum of the squares of residuals divided by the noise, per degree of freedom.
@@ -183,9 +186,9 @@ class Recovery(AbstractEstimate):
     - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
 
     Error bars assume that model and shape are right and that the noise of pixels is independent:
-    they describe precision, not accuracy. They include the error of unresolved layers: the width of
-    the transition is assumed known to a factor of 1.4, and the resulting error of the search is
-    part of the bars.
+    they describe precision, not accuracy. They include the error of unresolved layers: the width
+    below which layers are unresolved is assumed known to a factor of 1.4, and the change of the
+    coefficients that this factor causes is part of the bars.
     """
 
     material: Material

@@ -195,8 +195,8 @@ def write_exr(
     | channels | what they are |
     | --- | --- |
     | `R G B A` | beauty, premultiplied, and coverage |
-    | `Z` | depth, mm; inf where there is nothing |
-    | `position.X Y Z`, `normal.X Y Z` | of the front surface, world space, mm |
+    | `Z` | depth, mm; inf where no surface is visible |
+    | `position.X Y Z`, `normal.X Y Z` | of the front surface, in world space; positions in mm |
     | `albedo.R G B`, `irradiance.R G B`, `diffuse.R G B`, `specular.R G B` | premultiplied |
     | `single_scattering.R G B` | premultiplied; only when the material has such a term |
     | `shadow1.Y`, `shadow2.Y`, ... | per light |

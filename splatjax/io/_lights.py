@@ -142,9 +142,10 @@ def read_observations(path: StrPath) -> list[Observation]:
 
     A camera may have `up`. Other kinds of lights are "point" (`position` in mm, `intensity`,
     `cast_shadows`), "spot" (a point light with `direction`, `inner_angle` and `outer_angle` in
-    degrees), "beam" (`origin`, `direction`, `power`, `variance` in mm^2), and "rectangle",
-    "disk" and "sphere" (`center`, `radiance`; `edges`, or `direction` and `radius`, or `radius`;
-    `cast_shadows`). Color is one number per channel, or one for all.
+    degrees), "beam" (`origin`, `direction`, `power`, `variance` in mm^2), "rectangle" (`center`,
+    `radiance`, `edges`), "disk" (`center`, `radiance`, `direction`, `radius`) and "sphere"
+    (`center`, `radiance`, `radius`; all three `cast_shadows`). Color is one number per channel, or
+    one for all.
 
     **Returns:** an `Observation` for each picture, in JAX's default precision.
 

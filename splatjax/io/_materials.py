@@ -78,7 +78,8 @@ def load_material(name_or_path: StrPath | Table) -> Material:
 
     **Arguments:**
 
-    - `name_or_path`: one of `list_materials()`, the path of a TOML file, or the tables of one.
+    - `name_or_path`: one of `list_materials()`, the path of a TOML file, or its contents as a
+      `Table`.
 
     **Returns:** a `Material` in JAX's default precision; variances in mm^2, ascending.
 
@@ -189,6 +190,9 @@ def save_material(
     g: float = 0.0,
 ) -> None:
     r"""Write a material to a TOML file, completely or not at all.
+
+        save_material(material, "stone.toml", source={"provenance": "made up"})
+        material = load_material("stone.toml")
 
     **Arguments:**
 

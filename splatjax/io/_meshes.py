@@ -81,8 +81,8 @@ def sample_mesh(
     - `share`, `factors`: gray picture, not decoded: the fraction of the surface that consists of a
       second material, whose weights are `factors` times those of the first
       (`splatjax.fitting.weight_factors`).
-    - `v_up`: set it to `True` if the texture appears upside down. It means that v = 0 is the
-      *lower* edge of a map; `None` follows the format: the lower edge for all except glTF and GLB.
+    - `v_up`: whether v = 0 is the *lower* edge of a map. `None` follows the format: true, except in
+      glTF and GLB. If the texture appears upside down, give the opposite.
     - `up`: the file's upward axis, `"y"` or `"z"`; splats have +y up.
     - `crop_min_y`: the mesh below this height, in the file's unit, is removed.
     - `crease_angle`: degrees from 0 to 180. An edge is hard if its triangles differ by more than

@@ -47,14 +47,15 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
         width = 512
         height = 512
         [[lights]]
-        kind = "environment"         # or a kind of `read_observations`
+        kind = "environment"         # directional, point, spot, beam, rectangle, disk or sphere
         image = "studio"             # overcast, sun, or a file; rotation, strength, up
         [settings]                   # optional
         bounces = 1
         diffusion = "clusters"       # exitance or shape
 
-    A camera can instead be given by `position`, `rotation`, `focal_length` and `principal_point`,
-    or by `file`, `name` and `mm_per_unit` (`load_cameras`). The weights of a material given by name
+    `read_observations` lists the entries of the other lights. A camera can instead be given by
+    `position`, `rotation`, `focal_length` and `principal_point`, or by `file`, `name` and
+    `mm_per_unit` (`load_cameras`). The weights of a material given by name
     or file are divided by their sums if the splats have albedo, as on the command line.
 
     **Arguments:** `path`: path of a TOML file, or of a picture that the command line rendered.

@@ -15,9 +15,9 @@ from splatjax.cache import kept_jit
 from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, HarmonicLight, Scene
-from splatjax.splatting import invalid_factor
+from splatjax.splatting import PerspectiveView, invalid_factor
 
-from ._devices import on_devices, pad_scene
+from ._devices import cut_to, on_devices, pad_scene
 from ._lighting import Transfer
 from ._passes import SplatLight
 from ._plan import Plan, plan_unless_traced
@@ -134,10 +134,14 @@ def _diffusion_basis(
             )
 
         (*rows, specular), visible = passes.picture(
-            camera, lambda at: passes.light(at, kept=light, derivative=derivative), read
+            PerspectiveView.padded(camera),
+            lambda at: passes.light(at, kept=light, derivative=derivative),
+            read,
         )
         layers, per_exitance = jax.tree.map(in_a_row, rows)
         x, y = visible.grid.columns_and_rows(visible.tiles)
+        shown = (x < camera.width) & (y < camera.height)
+        share = jnp.where(shown, visible.share, 0)
         x, y = jnp.minimum(x, camera.width - 1), jnp.minimum(y, camera.height - 1)
         return DiffusionBasis(
             light=LayersAtPoints(
@@ -147,12 +151,12 @@ def _diffusion_basis(
                 **layers,
             ),
             pixel_radiance_per_exitance=(
-                invalid_factor(visible.needed) * visible.share.reshape(1, -1) * per_exitance
+                invalid_factor(visible.needed) * share.reshape(1, -1) * per_exitance
             ),
             pixels=(y * camera.width + x).reshape(-1),
             in_front=jnp.repeat(visible.in_front, x.shape[1]).astype(per_exitance.dtype),
-            specular=visible.picture(specular),
-            coverage=visible.picture(jnp.ones_like(specular[:, 0])),
+            specular=cut_to(camera, visible.picture(specular)),
+            coverage=cut_to(camera, visible.picture(jnp.ones_like(specular[:, 0]))),
             overflow=visible.overflow,
         )
 

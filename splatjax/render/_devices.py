@@ -17,7 +17,7 @@ from splatjax._chunking import Result
 from splatjax._combination import AbstractCombination, DeviceMesh, lay_out
 from splatjax._records import is_traced
 from splatjax.gaussians import pad_gaussians
-from splatjax.scene import AbstractLightSample, Frame, Scene, lights_by_kind
+from splatjax.scene import AbstractLightSample, Camera, Frame, Scene, lights_by_kind
 
 from ._checks import in_one_dtype
 from ._lighting import Transfer
@@ -46,6 +46,30 @@ class OwnRows(NamedTuple):
         """Remove the padding from a frame."""
         shown = self.of(frame, "layers", "weights", "unresolved_fraction")
         return dataclasses.replace(shown, shadow=rows_or_last(frame.shadow, self.lights))
+
+
+_WITHOUT_PIXELS = "weights", "unresolved_fraction", "overflow"
+_ROW_BY_ROW = "layers", "shadow"
+
+
+def cut_to(camera: Camera, picture: Shaped[Array, "..."], axis: int = 0) -> Shaped[Array, "..."]:
+    """Cut a picture of a padded view to that of its camera, whose rows are along an axis and whose
+    columns are along the next. Compile nothing outside `jit`.
+    """
+    if picture.shape[axis : axis + 2] == (camera.height, camera.width):
+        return picture
+    part = (slice(None),) * axis + (slice(camera.height), slice(camera.width))
+    return picture[part] if is_traced(picture) else jax.device_put(np.asarray(picture)[part])
+
+
+def cut_frame(frame: Frame, camera: Camera) -> Frame:
+    """Cut the pictures of a frame as `cut_to` does."""
+    cut = {
+        name: cut_to(camera, rows, axis=1 if name in _ROW_BY_ROW else 0)
+        for name, rows in vars(frame).items()
+        if name not in _WITHOUT_PIXELS and rows is not None
+    }
+    return dataclasses.replace(frame, **cut)
 
 
 def pad_scene(

@@ -13,8 +13,9 @@ from splatjax.cache import kept_jit
 from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
+from splatjax.splatting import PerspectiveView
 
-from ._devices import on_devices, pad_scene
+from ._devices import cut_frame, cut_to, on_devices, pad_scene
 from ._plan import Plan, plan_unless_traced
 from ._settings import LightAtSplats, RenderSettings, check_linear_in_weights
 from ._surface import ShadedSurface, SurfaceSamples, compose, layers_at_points
@@ -88,10 +89,14 @@ def picture_jacobian(
     r"""Render, and differentiate every pixel of `beauty` with respect to the weights and variances
     of the material.
 
-    The result is the derivative of the picture that `render` computes, with its approximations, and
-    equals reverse mode for each pixel. It takes less than two and a half times as long as `render`,
-    for any number of pixels or parameters. It is the Jacobian of Gauss and Newton's method for
-    least squares; `through` computes the Jacobian with respect to optical coefficients.
+        jacobian = picture_jacobian(scene, camera, plan=plan)
+        by_coefficient = jacobian.through(lambda m: fit_gaussians(Dipole(m)).gaussians, medium)
+        by_coefficient.sigma_a  # [height, width, channels, 3]: d pixel / d absorption
+
+    The derivatives are those of the picture that `render` computes, with its approximations. They
+    equal those of reverse mode, pixel by pixel, and take less than two and a half times as long as
+    `render`, for any number of pixels or parameters. Gauss and Newton's method for least squares
+    needs them; `through` continues them to optical coefficients.
 
     **Arguments:** as for `render`; under `jit` a plan is needed. With `ClusterDiffuser`, it cannot
     be differentiated again.
@@ -146,9 +151,10 @@ def _picture_jacobian(
             return shaded, per_exitance * of_weights, per_exitance * of_variances
 
         (shaded, *derivatives), visible = passes.picture(
-            camera, lambda at: passes.light(at, derivative=True), read
+            PerspectiveView.padded(camera), lambda at: passes.light(at, derivative=True), read
         )
-        pictures = [jnp.moveaxis(visible.picture(values), 2, 0) for values in derivatives]
-        return PictureJacobian(compose(scene, shaded, visible), *pictures)
+        pictures = [cut_to(camera, visible.picture(values)) for values in derivatives]
+        frame = cut_frame(compose(scene, shaded, visible), camera)
+        return PictureJacobian(frame, *(jnp.moveaxis(picture, 2, 0) for picture in pictures))
 
     return on_devices(differentiated, scene, settings, plan, camera)

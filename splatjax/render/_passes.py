@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
 from splatjax._chunking import Result, map_chunks, take_points
 from splatjax._combination import AbstractCombination
-from splatjax.scene import Camera, Scene, stack_lights
+from splatjax.scene import Scene, stack_lights
 
 from ._lighting import (
     Irradiance,
@@ -205,7 +205,7 @@ class Passes(eqx.Module):
 
     def picture(
         self,
-        camera: Camera,
+        view: _splatting.PerspectiveView,
         light_at: Callable[[Int[Array, " chosen"]], SplatLight],
         read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Result],
     ) -> tuple[Result, _splatting.VisibleSurfaces]:
@@ -222,7 +222,7 @@ class Passes(eqx.Module):
         passes.
         """
         scene, settings, plan = self.scene, self.settings, self.plan
-        view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
+        groups = stack_lights(scene.lights)
         chosen, chosen_needed = plan.raster.choose(scene.splats, view)
         light = light_at(chosen)
 
@@ -231,7 +231,7 @@ class Passes(eqx.Module):
         visible_scene = Scene(splats, scene.lights, scene.material)
         shown = plan.diffusion.shown(visible_scene)
         layers = plan.diffusion.towards(
-            camera.position, scene.splats, scene.material, light.layers, light.solved, chosen
+            view.position, scene.splats, scene.material, light.layers, light.solved, chosen
         )
         attributes = settings.lighting.attributes(
             visible_scene,

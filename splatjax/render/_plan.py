@@ -125,7 +125,7 @@ def make_plan(
     check_planned(scenes, cameras)
     (scene, *other_scenes), cameras = _on_one_device((scenes, cameras))
     scene, other_scenes, cameras = in_one_dtype(scene, other_scenes, cameras)
-    views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
+    views = [view for camera in cameras for view in _planned_views(camera)]
     parts, order, exists = _cut_and_order(scene.splats, mesh)
     bounds, interval, splatting = _measure(parts, settings)
     gaussians = scene.material.gaussians
@@ -156,6 +156,14 @@ def make_plan(
     return jax.tree.map(
         lambda leaf, spec: jax.device_put(leaf, NamedSharding(mesh, spec)), plan, specs
     )
+
+
+def _planned_views(camera: Camera) -> list[_splatting.PerspectiveView]:
+    """Return the view of a camera, and that of the largest picture that shares its program."""
+    view = _splatting.PerspectiveView.padded(camera)
+    if (view.width, view.height) == (camera.width, camera.height):
+        return [view]
+    return [view, view.enlarged(camera)]
 
 
 def splats_per_device(count: int, mesh: Mesh | None) -> tuple[int, int]:

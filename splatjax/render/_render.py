@@ -12,9 +12,10 @@ from splatjax._combination import lay_out
 from splatjax.cache import kept_jit
 from splatjax.diffusion import Sources
 from splatjax.scene import Camera, Frame, Scene
+from splatjax.splatting import PerspectiveView
 
 from ._checks import check_channels
-from ._devices import on_devices, pad_scene, resize_visibility
+from ._devices import cut_frame, cut_to, on_devices, pad_scene, resize_visibility
 from ._lighting import Irradiance, Transfer
 from ._passes import SplatLight
 from ._plan import Plan, check_plan, plan_unless_traced, splats_per_device
@@ -47,9 +48,10 @@ def render(
       `jit`, `grad` and `vmap`; otherwise made for each call.
     - `mesh`: devices over which the splats and their gradients are divided, of any axes
       (docs/devices.md). By default the mesh of the plan.
-    - `light`: a precomputed result for the same settings and plan, to save time. For the same scene
-      and another camera, from `splatjax.illuminate` (passes 1 and 4); for the same splats and
-      lights of another strength, from `splatjax.transfer` (pass 1). Differentiable.
+    - `light`: a precomputed result for the same settings and plan, to save time: from
+      `splatjax.illuminate` (passes 1 and 4) for the same scene and another camera, or from
+      `splatjax.transfer` (pass 1) for the same splats and lights of another strength.
+      Differentiable.
 
     **Returns:** a `Frame` in the dtype of `splats.centers`. With a mesh, every device has the whole
     frame, equal to that without a mesh up to rounding.
@@ -60,24 +62,25 @@ def render(
     """
     plan = plan_unless_traced(scene, camera, settings, plan, mesh)
     scene, plan, light, own_rows = pad_scene(scene, plan, light, camera)
-    return own_rows.frame(_render(scene, camera, settings, plan, light))
+    frame = _render(scene, PerspectiveView.padded(camera), settings, plan, light)
+    return cut_frame(own_rows.frame(frame), camera)
 
 
 @kept_jit
 def _render(
     scene: Scene,
-    camera: Camera,
+    view: PerspectiveView,
     settings: RenderSettings,
     plan: Plan,
     light: SplatLight | Transfer | None,
 ) -> Frame:
-    def picture(passes, camera, light=None):
+    def picture(passes, view, light=None):
         shaded, visible = passes.picture(
-            camera, lambda at: passes.light(at, kept=light), lambda shaded, *_: shaded
+            view, lambda at: passes.light(at, kept=light), lambda shaded, *_: shaded
         )
         return compose(plan.diffusion.shown(passes.scene), shaded, visible)
 
-    return on_devices(picture, scene, settings, plan, camera, placed=light)
+    return on_devices(picture, scene, settings, plan, view, placed=light)
 
 
 def illuminate(
@@ -255,7 +258,7 @@ def _diffuse_irradiance(
         def read(shaded, layers, samples):
             return layers.weigh(gaussians, material.single_scattering_albedo())[0]
 
-        layers, visible = passes.picture(camera, light_at, read)
-        return jnp.moveaxis(visible.front_picture(layers), 2, 0)
+        layers, visible = passes.picture(PerspectiveView.padded(camera), light_at, read)
+        return jnp.moveaxis(cut_to(camera, visible.front_picture(layers)), 2, 0)
 
     return on_devices(diffuse, dark, plain, plan, camera, rows=(irradiance,))

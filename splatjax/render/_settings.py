@@ -79,24 +79,24 @@ class RenderSettings(eqx.Module):
     (`ExitanceDiffuser`) or thin parts (`ShapeDiffuser`), and `sample_shadows` for sharper shadows
     of environments and area lights.
 
-    **Attributes:**
+    **Attributes:** (their classes are in `splatjax.splatting` and `splatjax.diffusion`)
 
-    - `splatting`: passes 2 and 3: how far behind the foremost fragment the front surface extends
-      (epsilon-z), and the filter of splats smaller than a pixel.
+    - `splatting`: passes 2 and 3: the depth within which fragments belong to the front surface
+      (epsilon-z), the filter of splats smaller than a pixel, and the coverage of outlines.
     - `shadows`: pass 1: resolution, bias and softness of shadow maps.
-    - `sample_shadows`: the same for the samples of environments and area lights, which are many, so
-      each map is coarser. `ShadowSettings()` makes their maps as fine as those of other lights.
+    - `sample_shadows`: the same for environments and area lights. They have many samples, so each
+      map is coarser; `ShadowSettings()` makes it as fine as those of other lights.
     - `bounces`: number of times that light may leave the body and enter it again. Static.
     - `sightlines`: the directions in which each splat searches the body, for bounces.
-    - `kernel`: pass 4: source depth, normalization, and resolution of a layer.
-      `EscapeNormalization()`, or `PlainMean()`, the kernel of the paper.
-    - `rasterizer`: algorithm of passes 1 to 3. `TileRasterizer()`, or `DenseRasterizer()`, the
-      plain reference.
-    - `diffuser`: algorithm of pass 4. `ClusterDiffuser()`; `ExitanceDiffuser()`, the same in less
-      time, without separate layers; `DenseDiffuser()`, the plain reference; or `ShapeDiffuser()`,
-      which solves the diffusion equation in the body.
-    - `lighting`: where irradiance is computed. `LightAtSplats()` blends the irradiance of the
-      splats; `splatjax.baselines` has other classes.
+    - `kernel`: pass 4: source depth, normalization, and resolution of a layer. By default
+      `EscapeNormalization()`; `PlainMean()` is the kernel of the paper.
+    - `rasterizer`: algorithm of passes 1 to 3. By default `TileRasterizer()`; `DenseRasterizer()`
+      is the plain reference.
+    - `diffuser`: algorithm of pass 4. By default `ClusterDiffuser()`. `ExitanceDiffuser()` takes
+      less time and has no separate layers; `ShapeDiffuser()` solves the diffusion equation in the
+      body; `DenseDiffuser()` is the plain reference.
+    - `lighting`: where irradiance is computed. By default `LightAtSplats()`, which blends the
+      irradiance of the splats; `splatjax.baselines` has other classes.
     """
 
     splatting: _splatting.SplattingSettings = _splatting.SplattingSettings()

@@ -29,6 +29,7 @@ from splatjax.scene import (
 )
 
 from ._checks import check_channels, in_one_dtype
+from ._devices import cut_frame
 from ._lighting import (
     Irradiance,
     LightVisibility,
@@ -104,7 +105,7 @@ def render_streamed(
     first = next(iter(scenes("looking")))
     check_channels(first)
     (first, camera), groups = in_one_dtype(first, camera), stack_lights(first.lights)
-    dtype, view = first.splats.centers.dtype, _splatting.PerspectiveView.of(camera)
+    dtype, view = first.splats.centers.dtype, _splatting.PerspectiveView.padded(camera)
     middle, reach = (jnp.asarray(bound, dtype) for bound in (statistics.middle, statistics.reach))
     bounds = _splatting.Bounds(middle, reach)
     uneven = jnp.asarray(statistics.unevenness, dtype)
@@ -176,7 +177,7 @@ def render_streamed(
     layers = diffusion.evaluate(sources(), first.material.channels)
 
     # Pass 5.
-    return _shade(
+    frame = _shade(
         first,
         view,
         groups,
@@ -187,6 +188,7 @@ def render_streamed(
         interval,
         settings,
     )
+    return cut_frame(frame, camera)
 
 
 def _sum_views(

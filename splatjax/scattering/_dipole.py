@@ -113,12 +113,13 @@ class Dipole(AbstractDipole):
 
         Dipole(load_medium("marble"))(jnp.linspace(0.5, 2, 3))  # [radii, channels], 1/mm^2
 
-    With `sigma_t' = sigma_a + sigma_s'`, `alpha' = sigma_s' / sigma_t'`, `sigma_tr^2 = 3 sigma_a
-    sigma_t'`, `A = (1 + Fdr) / (1 - Fdr)` with the diffuse reflectance `Fdr` of the surface from
-    inside, `z_r = 1 / sigma_t'`, `z_v = z_r (1 + 4A/3)` and `d^2 = r^2 + z^2`,
+    A source below the surface and its image above give
 
-        R(r) = alpha' / (4 pi) * sum over z in (z_r, z_v) of z (1 + sigma_tr d) exp(-sigma_tr d) /
-        d^3.
+        R(r) = alpha' / (4 pi) * sum over z in (z_r, z_v) of z (1 + s d) exp(-s d) / d^3
+
+    with `d^2 = r^2 + z^2`, `s = sigma_tr`, `sigma_tr^2 = 3 sigma_a sigma_t'`, `z_r = 1 / sigma_t'`,
+    `z_v = z_r (1 + 4A/3)`, `A = (1 + Fdr) / (1 - Fdr)`, `alpha' = sigma_s' / sigma_t'` and
+    `sigma_t' = sigma_a + sigma_s'`. `Fdr` is the diffuse reflectance of the surface from inside.
 
     **Attributes:**
 

@@ -20,6 +20,7 @@ class Medium(eqx.Module):
     r"""The optical coefficients of a homogeneous material.
 
         Medium([0.020, 0.006, 0.015], [1.1, 1.3, 1.5], eta=1.6)
+        Medium((1 - albedo) * sigma_t, albedo * sigma_t * (1 - g), eta)  # of extinction and albedo
 
     **Attributes:** (any number of channels; a single number is for all of them; differentiable)
 

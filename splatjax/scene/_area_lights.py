@@ -107,11 +107,11 @@ class RectangleLight(AbstractAreaLight):
     **Attributes:**
 
     - `center`: mm. Differentiable.
-    - `radiance`: radiance of the emitting side. A white diffuser under a whole sky of this radiance
-      has the same radiance. Differentiable.
+    - `radiance`: radiance of the emitting side. From a whole sky of radiance L, a white diffuser
+      has the radiance L. Differentiable.
     - `edges`: two edge vectors, perpendicular, mm: the rectangle extends by half of each to either
       side of `center`. It emits in the direction of their cross product. Differentiable.
-    - `count`, `cast_shadows`: static.
+    - `count`: number of samples, each with a shadow map if `cast_shadows`. Both static.
     """
 
     edges: Float[Array, "2 3"] = eqx.field(converter=numbers)
@@ -179,7 +179,7 @@ class RectangleLight(AbstractAreaLight):
 class DiskLight(AbstractAreaLight):
     r"""A disk of uniform radiance that emits to one side.
 
-    **Attributes:** as of `RectangleLight`, and
+    **Attributes:** `center`, `radiance`, `count` and `cast_shadows` as of `RectangleLight`, and
 
     - `direction`: normal of the side that emits, any length but zero. Differentiable.
     - `radius`: mm. Differentiable.
@@ -223,7 +223,7 @@ class SphereLight(AbstractAreaLight):
     Its samples fill the ball so that from every side they have the distribution of a uniform disk.
     The result is invalid for points inside the ball.
 
-    **Attributes:** as of `RectangleLight`, and
+    **Attributes:** `center`, `radiance`, `count` and `cast_shadows` as of `RectangleLight`, and
 
     - `radius`: mm. Differentiable.
     """

@@ -27,9 +27,9 @@ _ROUGHNESSES = np.geomspace(0.05, 1.0, 7)  # roughnesses of the blurred maps
 class EnvironmentLight(AbstractExtendedLight):
     r"""Distant light from all directions, given by an image.
 
-    The image is a latitude-longitude map as OpenEXR defines it, with square pixels: the upper edge
-    is +y and the lower one -y; the middle is +z, a quarter of the width to the left of it is +x,
-    and both side edges are -z. This is the view from inside the sphere.
+    The image is a latitude-longitude map as OpenEXR defines it, with square pixels, seen from
+    inside the sphere. Its rows run from +y at the top to -y at the bottom. Its columns show, from
+    left to right, the directions -z, +x, +z (in the middle), -x and -z.
 
         sky = EnvironmentLight(overcast_sky(), rotation=30, strength=0.5)
 

@@ -43,8 +43,8 @@ class Material(eqx.Module):
     - `roughness`: root mean square slope of the surface (m), at least 0; rendered as 0.05 to 1.
     - `single_scattering`: light that scatters once, as a separate term; the Gaussians then
       represent the rest. `None`: the Gaussians represent all light.
-    - `angles`: the dependence of the light of the Gaussians on the angles at which it enters and
-      leaves. `None`: no dependence.
+    - `angles`: how the light of the Gaussians depends on the angles of entry and exit. `None`: no
+      dependence.
     - `medium`: coefficients, which `ShapeDiffuser` uses instead of Gaussians, single scattering and
       angles; or `None`.
 
@@ -85,14 +85,14 @@ class Material(eqx.Module):
         **surface: Any,
     ) -> "Material":
         """Fit a material to optical coefficients, as `splatjax fit` does. Differentiable in the
-        medium. The fit is as precise as the medium: create it in float64
-        (`jax.enable_x64`) for the numbers of the command.
+        medium. The fit has the precision of the medium: for the numbers of the command, create the
+        medium in float64 (`jax.enable_x64`).
 
         **Arguments:**
 
         - `count`: number of Gaussians.
-        - `model`: the model of the profile; by default light transport, `TransportModel(g=0.8)` for
-          light that scatters forward.
+        - `model`: the model of the profile: by default light transport with isotropic scattering;
+          `TransportModel(g=0.8)` for forward scattering.
         - `surface`: `specular`, `roughness`, and `eta`, by default the medium's.
 
         **Raises:** `ValueError` as `fit_gaussians` does.

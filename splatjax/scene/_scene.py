@@ -158,8 +158,8 @@ class Splats(eqx.Module):
       if the material alone gives the color.
     - `specular`: factor on the material's specular strength; `None` for 1.
     - `roughness`: factor on the material's roughness; `None` for 1.
-    - `weights`: factor on the material's weights, for each Gaussian and channel, by which the
-      material varies over the body: freckles, lips, veins. `None` for 1.
+    - `weights`: factor on the material's weights, for each Gaussian and channel. It varies the
+      material over the body: freckles, lips, veins. `None` for 1.
 
     **Raises:** `ValueError` for arrays of different lengths, for entries that are not finite, for
     negative radii, areas and factors, and for an albedo outside [0, 1].
@@ -224,7 +224,8 @@ class Scene(eqx.Module):
     - `splats`: the surface of the body.
     - `lights`: any number, as a list, a tuple, or a single light. A light of one channel applies to
       every channel of the material. Lights of one kind are computed together.
-    - `material`: the material of all splats. For splats with albedo, usually `material.white()`.
+    - `material`: the material of all splats. If they have an albedo, use `material.white()`, so
+      that the albedo alone gives the color.
     """
 
     splats: Splats

@@ -1,12 +1,16 @@
 """Views of cameras and near lights (perspective), and of distant lights (orthographic)."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
+from splatjax._chunking import rounded_up
 from splatjax.scene import Camera, Splats
 
+from ._grid import TILE_SIDE
 from ._views import (
     EDGE_ON,
     MARGIN,
@@ -40,6 +44,32 @@ class PerspectiveView(AbstractView):
             height=camera.height,
             near=camera.near,
             principal_pixel=None if camera.principal_point is None else camera.principal_pixel,
+        )
+
+    @classmethod
+    def padded(cls, camera: Camera) -> "PerspectiveView":
+        """Return the view of a camera with further pixels on the right and below, by a sixteenth
+        of each side at most, so that pictures of nearby sizes share a program.
+        """
+        dtype = camera.position.dtype
+        view, (column, row) = cls.of(camera), camera.principal_pixel
+        return dataclasses.replace(
+            view,
+            width=rounded_up(camera.width, TILE_SIDE, per_octave=16),
+            height=rounded_up(camera.height, TILE_SIDE, per_octave=16),
+            principal_pixel=(jnp.asarray(column, dtype), jnp.asarray(row, dtype)),
+        )
+
+    def enlarged(self, camera: Camera) -> "PerspectiveView":
+        """Return the view of a camera on the grid of this one, enlarged to fill it: its capacity
+        suffices for all smaller pictures of the same field of view.
+        """
+        scale = min(self.width / camera.width, self.height / camera.height)
+        column, row = self.axis_pixel
+        return dataclasses.replace(
+            self,
+            focal_length=scale * self.focal_length,
+            principal_pixel=(scale * column, scale * row),
         )
 
     @property

@@ -34,20 +34,20 @@ class ShadowSettings(eqx.Module):
     **Attributes:**
 
     - `resolution`: pixels along a side of each map, at most.
-    - `pixels_per_spacing`: limits the map to this many pixels per spacing of the splats, because a
-      finer map would show single discs instead of the body. The resulting size is rounded up, to
-      one of two sizes per octave, and is at least 64. `inf` for the full resolution.
-    - `bias`: a surface less than this distance behind the surface of the map is fully lit, so that
-      a surface does not shadow itself. The unit is the reach of the splat in the map: the root of
-      the sum of the squares of its radius (of the merged splat, if splats are merged) and of a
-      pixel's diagonal.
-    - `softness`: the number of further reaches over which the light fades, so that shadows have
+    - `pixels_per_spacing`: most pixels of the map per spacing of the splats, because a finer map
+      would show single discs instead of the body. The resulting size is rounded up, to one of two
+      sizes per octave, and is at least 64. `inf` for the full resolution.
+    - `bias`: up to this distance behind the surface of the map a splat is fully lit, so that a
+      surface does not shadow itself. The unit of `bias` and `softness` is the reach of a splat,
+      `sqrt(radius^2 + diagonal^2)`: the radius of the splat, or of its merged disc, and the
+      diagonal of a pixel of the map at its depth.
+    - `softness`: beyond `bias` the light fades to 0 over this distance, so that shadows have
       gradients with respect to depth. Across the edge of a shadow, light fades over about two
       pixels of the map.
-    - `compared`: the side of the square of pixels with which a splat is compared, 2 or 3.
-    - `merged_spacing`: neighboring splats are merged, 8, 16 or 32 to a disc, as long as the discs
-      are at most this many pixels of the map apart; 0 merges none. Splats that are already farther
-      apart than about a third of this are not merged.
+    - `compared`: a splat is compared with a square of this many pixels a side, 2 or 3.
+    - `merged_spacing`: largest spacing of merged discs, in pixels of the map. Neighboring splats
+      are merged to discs of 8, 16 or 32, the most that this spacing allows; 0 merges none. Splats
+      that are farther apart than about a third of it are not merged.
     - `largest_slope`: the slope up to which the receiver's plane is continued from pixel to pixel
       of the map. On heads, 4 leaves steps at grazing light, and more than 8 has no effect.
     """

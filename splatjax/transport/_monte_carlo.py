@@ -86,8 +86,8 @@ def monte_carlo(
     models, for any thickness and absorption.
 
     Photons fly from one scattering event to the next; absorption reduces their weight; interfaces
-    reflect or refract them by Fresnel's formulas. Channels that differ only in absorption, or only
-    in scale (a half space of one index), share their walks, and therefore their errors.
+    reflect or refract them by Fresnel's formulas. Channels share their walks, and therefore their
+    errors, if they differ only in absorption or, in a half space of one index, only in scale.
 
     Differentiable in `sigma_a`, `sigma_s_prime` and the optical depth of films, in forward and
     reverse mode, by the likelihood of each path. The standard errors are constants.

@@ -2,6 +2,7 @@
 are warned of, or refused before they are rendered.
 """
 
+import dataclasses
 import warnings
 from functools import cache, partial
 
@@ -235,8 +236,14 @@ def test_splats_that_do_not_fit_are_refused_before_they_are_rendered(monkeypatch
 def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compiled):
     skin, four = sj.load_material("skin"), of_four_gaussians()
 
-    def render(body: sj.Splats, eye=(66, 4, 140), lights=(lamp(0.5, -0.5, -1.0),), material=skin):
-        camera = sj.Camera.look_at(eye, (0, -9, 0), fov=30, width=64, height=64)
+    def render(
+        body: sj.Splats,
+        eye=(66, 4, 140),
+        lights=(lamp(0.5, -0.5, -1.0),),
+        material=skin,
+        size=(64, 64),
+    ):
+        camera = sj.Camera.look_at(eye, (0, -9, 0), fov=30, width=size[0], height=size[1])
         scene = sj.Scene(body, (*lights, point(140.0)), material)
         return sj.render(scene, camera, SMALL_MAPS).beauty
 
@@ -257,11 +264,41 @@ def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compi
         # Lights are sorted by kind.
         render(bust, lights=[low, point(130.0), left]),
         render(bust, lights=[point(130.0), left, low, low]),
+        render(bust, size=(59, 62)),
+        render(bust, size=(57, 57)),
     ]
     assert compiled == []
     for i, other in enumerate(others):
         assert np.all(np.isfinite(other))
         assert not any(np.array_equal(other, before) for before in [first, *others[:i]])
+
+
+def test_a_picture_of_any_size_is_part_of_a_larger_one():
+    """Pictures are rendered with further pixels, which are in no result."""
+    body = sj.bust(3_000).scaled(0.2)
+    scene = sj.Scene(body, (lamp(0.5, -0.5, -1.0), point(140.0)), sj.load_material("skin"))
+    whole = sj.Camera.look_at((66, 4, 140), (0, -9, 0), fov=15, width=80, height=80)
+    part = dataclasses.replace(
+        whole,
+        width=67,
+        height=75,
+        focal_length=whole.focal_length * 80 / 75,
+        principal_point=(40 / 67, 40 / 75),
+    )
+    plan = sj.make_plan(scene, part, SMALL_MAPS)
+    frame = sj.render(scene, part, SMALL_MAPS, plan)
+    expected = sj.render(scene, whole, SMALL_MAPS)
+    assert frame.layers.shape[1:3] == frame.shadow.shape[1:] == frame.depth.shape == (75, 67)
+    for name in ("beauty", "coverage", "normal"):
+        cut = getattr(expected, name)[:75, :67]
+        assert jnp.allclose(getattr(frame, name), cut, rtol=1e-4, atol=1e-4)
+    jitted = jax.jit(lambda s: sj.render(s, part, SMALL_MAPS, plan))(scene)
+    jacobian = sj.picture_jacobian(scene, part, SMALL_MAPS, plan)
+    for same in (jitted, jacobian.frame):
+        assert_close(same, frame, rtol=1e-4, atol=1e-4)
+    basis = sj.diffusion_basis(scene, part, SMALL_MAPS, plan)
+    beauty = basis.beauty(scene.material.gaussians)
+    assert jnp.allclose(beauty, frame.beauty, rtol=1e-4, atol=1e-5)
 
 
 def test_lights_and_gaussians_that_fill_up_are_in_no_result():
