@@ -35,9 +35,9 @@ class BinCapacity(eqx.Module):
         counts = [np.asarray(tiles, np.int64) for tiles in per_tile]
         pairs = max(int(tiles.sum()) for tiles in counts)
         chunks = max(-(-int((tiles > 0).sum()) // grid.lanes) for tiles in counts)
-        chunks = with_spare(("chunks", grid), chunks, -(-grid.half // 4), spare=spare)
+        chunks = with_spare(("chunks", grid), chunks, -(-grid.half // 2), spare=spare)
         return cls(
-            with_spare(("pairs", grid), max(pairs, 1), _ROW, per_octave=4, spare=spare),
+            with_spare(("pairs", grid), max(pairs, 1), _ROW, per_octave=2, spare=spare),
             min(max(chunks, grid.half), grid.padded_count // grid.lanes),
         )
 

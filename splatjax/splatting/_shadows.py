@@ -5,6 +5,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks, rounded_up
@@ -29,14 +30,14 @@ _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 
 @record
 class ShadowSettings(eqx.Module):
-    r"""Settings of shadow maps and of the comparison with them. All static.
+    r"""Settings of shadow maps and of the comparison with them. Static, but for the last.
 
     **Attributes:**
 
     - `resolution`: pixels along a side of each map, at most.
     - `pixels_per_spacing`: most pixels of the map per spacing of the splats, because a finer map
       would show single discs instead of the body. The resulting size is rounded up, to one of two
-      sizes per octave, and is at least 64. `inf` for the full resolution.
+      sizes per octave (`filled`), and is at least 64. `inf` for the full resolution.
     - `bias`: up to this distance behind the surface of the map a splat is fully lit, so that a
       surface does not shadow itself. The unit of `bias` and `softness` is the reach of a splat,
       `sqrt(radius^2 + diagonal^2)`: the radius of the splat, or of its merged disc, and the
@@ -50,6 +51,8 @@ class ShadowSettings(eqx.Module):
       that are farther apart than about a third of it are not merged.
     - `largest_slope`: the slope up to which the receiver's plane is continued from pixel to pixel
       of the map. On heads, 4 leaves steps at grazing light, and more than 8 has no effect.
+    - `filled`: pixels along a side of the part of the map that shows the body, `resolution` at
+      most. `None` to derive it from the splats (`for_spacing`).
     """
 
     resolution: int = eqx.field(static=True, default=1024)
@@ -66,19 +69,32 @@ class ShadowSettings(eqx.Module):
         metadata=valid("positive; inf for the full resolution", lambda x: x > 0, finite=False),
     )
 
+    filled: float | Float[Array, ""] | None = eqx.field(
+        default=None, metadata=valid("positive (pixels)", lambda x: x > 0)
+    )
+
+    @property
+    def side(self) -> int | float | Float[Array, ""]:
+        """The pixels along a side of the part of the map that shows the body."""
+        return self.resolution if self.filled is None else self.filled
+
     def for_spacing(self, spacing: float, bounds: "Bounds") -> "ShadowSettings":
-        """Return the settings with the resolution for a spacing of the splats, mm. Not for traced
-        arrays.
+        """Return the settings with the resolution for a spacing of the splats, mm: a power of 2 at
+        most, so that maps of other bodies share its program. Not for traced arrays.
         """
-        across = self.pixels_per_spacing * 2 * float(bounds.radius)
-        if across >= self.resolution * spacing:
-            return self
-        resolution = rounded_up(max(int(across / spacing), 1), _LEAST_RESOLUTION, per_octave=2)
-        return dataclasses.replace(self, resolution=min(resolution, self.resolution))
+        across, filled = self.pixels_per_spacing * 2 * float(bounds.radius), self.resolution
+        if across < filled * spacing:
+            finest = rounded_up(max(int(across / spacing), 1), _LEAST_RESOLUTION, per_octave=2)
+            filled = min(finest, filled)
+        return dataclasses.replace(
+            self,
+            resolution=min(1 << (filled - 1).bit_length(), self.resolution),
+            filled=jax.device_put(np.asarray(filled, bounds.radius.dtype)),
+        )
 
     def splats_per_disc(self, spacing: float, bounds: "Bounds") -> int:
         """Return the number of splats in each merged disc. Not for traced arrays."""
-        largest = self.merged_spacing * 2 * float(bounds.radius) / self.resolution
+        largest = self.merged_spacing * 2 * float(bounds.radius) / float(self.side)
         return max((n for n in MERGED_COUNTS if n**0.5 * spacing <= largest), default=1)
 
 
@@ -120,6 +136,7 @@ def _rotation_towards(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return rotation_towards(forward, up)
 
 
+@jit_unless_traced
 def distant_view(
     direction: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings
 ) -> OrthographicView:
@@ -128,12 +145,13 @@ def distant_view(
     return OrthographicView(
         position=bounds.center,
         rotation=_rotation_towards(direction / jnp.linalg.norm(direction)),
-        scale=0.5 * (size - 4) / bounds.radius,
+        scale=0.5 * (settings.side - 4) / bounds.radius,
         width=size,
         height=size,
     )
 
 
+@jit_unless_traced
 def near_view(
     position: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings
 ) -> PerspectiveView:
@@ -146,7 +164,7 @@ def near_view(
     return PerspectiveView(
         position=position,
         rotation=_rotation_towards(to_center / distance),
-        focal_length=0.5 * (size - 4) / tangent,
+        focal_length=0.5 * (settings.side - 4) / tangent,
         width=size,
         height=size,
         near=_NEAR,
@@ -157,9 +175,8 @@ def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[Pe
     """Make the views of a point light inside the bounding sphere: six faces of a cube."""
     size, dtype = settings.resolution, position.dtype
     axes = jnp.concatenate([jnp.eye(3, dtype=dtype), -jnp.eye(3, dtype=dtype)])
-    focal_length = jnp.asarray(
-        0.5 * (size - 4), dtype
-    )  # two pixels beyond each edge, for the filter
+    # Two pixels beyond each edge, for the filter.
+    focal_length = jnp.asarray(0.5 * (settings.side - 4), dtype)
     return [
         PerspectiveView(
             position=position,

@@ -129,7 +129,7 @@ class TilePlan(AbstractRasterPlan):
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
         capacity = -(-int(_SPARE * most + 1) // grain) * grain
-        behind = reuse_capacity(("behind", grid, grain), int(1.25 * most) + 1, capacity)
+        behind = reuse_capacity(("behind", grid, grain), int(1.25 * most) + 1, capacity, most=2.0)
         return dataclasses.replace(self, places=SurfaceCapacity(self.places.front, behind))
 
     def choose(

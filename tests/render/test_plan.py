@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from bodies import PLAIN, assert_close, assert_refused, joined, sheet, sphere, two_gaussians
 
 import splatjax as sj
@@ -249,10 +250,17 @@ def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compi
 
     bust = sj.bust(2_000).scaled(0.2)
     larger, fewer = bust.scaled(1.05), jax.tree.map(lambda leaf: leaf[:1_930], bust)
-    first = render(bust)
+    torus = trimesh.creation.torus(25.0, 9.0)
+    torus = sj.geometry.sample_mesh(
+        sj.geometry.Mesh(torus.vertices, torus.faces, torus.vertex_normals), 2_000
+    )
+    shape = {name: getattr(torus, name) for name in ("centers", "normals", "radii", "areas")}
+    torus = dataclasses.replace(bust, **shape)  # with the maps of the bust
+    first = render(torus)  # which needs more capacity than the bust
     low, left, right = lamp(0.3, -0.2, -1.0), lamp(-0.5, -0.3, -1.0), lamp(0.5, -0.4, -0.9)
     compiled.clear()
     others = [
+        render(bust),
         render(larger),
         render(fewer),
         render(bust, eye=(-60, 24, 140)),

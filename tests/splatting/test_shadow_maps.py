@@ -179,7 +179,7 @@ def test_a_map_no_finer_than_its_splats_shows_the_whole_shadow(scale):
         view = distant_view(jnp.asarray([0.3, 0.1, -1.0]), bounds_of(body), settings)
         visible = visibility(body, view, plan_for(view, body), settings)[:floor]
         shadow = np.sum((1 - np.asarray(visible, float)) * np.asarray(body.areas[:floor], float))
-        blocked[settings.resolution] = shadow / scale**2
+        blocked[int(settings.side)] = shadow / scale**2
     assert list(blocked) == [192, 1024]
     # The disc's shadow extends by half a spacing of its splats.
     expected = np.pi * (RADIUS + 0.25) ** 2
