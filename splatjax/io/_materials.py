@@ -1,5 +1,8 @@
 """Materials as TOML files: optical coefficients, their source, and the Gaussians fitted to them."""
 
+import hashlib
+import json
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -65,36 +68,43 @@ def material_path(name_or_path: StrPath) -> Path:
     path = Path(name_or_path)
     if not isinstance(name_or_path, str) or path.suffix or len(path.parts) != 1:
         return path
-    if name_or_path in list_materials():
-        return profiles_folder() / f"{name_or_path}.toml"
-    raise ValueError(
-        f"{name_or_path}: is not a known material; {nearest(name_or_path, list_materials())} "
-        f"(a file is named by its path: ./{name_or_path}.toml)"
+    require(
+        name_or_path in list_materials(),
+        name_or_path,
+        f"is not a known material; {nearest(name_or_path, list_materials())} (a file is named by "
+        f"its path: ./{name_or_path}.toml)",
     )
+    return profiles_folder() / f"{name_or_path}.toml"
 
 
 def load_material(name_or_path: StrPath | Table) -> Material:
     r"""Load a material: its fitted Gaussians and its surface.
 
-    **Arguments:**
-
-    - `name_or_path`: one of `list_materials()`, the path of a TOML file, or its contents as a
-      `Table`.
+    **Arguments:** `name_or_path`: one of `list_materials()`, the path of a TOML file, or its
+    contents as a `Table`.
 
     **Returns:** a `Material` in JAX's default precision; variances in mm^2, ascending.
+
+    A warning reports coefficients that were changed after their fit.
 
     **Raises:** `ValueError` for an unknown name, and for a file that is not a material, with the
     fault and the remedy.
     """
     tables, surface, profile = _read(name_or_path)
     path, fitted = tables.path, tables.path.with_name(f"{tables.path.stem}_fitted.toml")
-    require(
-        "fit" in tables.entries,
-        path,
-        f"has no [fit]; fit its coefficients by `splatjax fit {path} --output {fitted}`",
-    )
+    remedy = f"fit its coefficients by `splatjax fit {path} --output {fitted}`"
+    require("fit" in tables.entries, path, f"has no [fit]; {remedy}")
     fit = tables.table("fit", tables.entries["fit"])
     fit.one_of("unit", [VARIANCE_UNIT])
+    digest = _digest(tables.entries)
+    if fit.entries.get("coefficients_digest", digest) != digest:
+        if tables.name:  # it is a table of a scene
+            remedy = "copy it to a file, `splatjax fit` that, and name the result as `material`"
+        warnings.warn(
+            f"{tables.where.rstrip(':')} has coefficients that were changed after the fit, so its "
+            f"Gaussians are those of others; {remedy}",
+            stacklevel=1,  # a command that loads a file several times warns once
+        )
     gaussians = fit.record(SumOfGaussians)
     fit.make(
         check_values,
@@ -126,9 +136,7 @@ def surface_and_source(name_or_path: StrPath) -> tuple[dict[str, Any], dict[str,
 def load_medium(name_or_path: StrPath) -> Medium:
     r"""Load the optical coefficients of a material.
 
-    **Arguments:**
-
-    - `name_or_path`: one of `list_materials()`, or the path of a TOML file.
+    **Arguments:** `name_or_path`: one of `list_materials()`, or the path of a TOML file.
 
     **Returns:** a `Medium` in JAX's default precision; coefficients in 1/mm.
 
@@ -159,12 +167,10 @@ def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin:
     r"""Load the coefficients of a material as a profile to which Gaussians can be fitted, or its
     pigments.
 
-    **Arguments:**
+    **Arguments:** `name_or_path`: one of `list_materials()`, or the path of a TOML file.
 
-    - `name_or_path`: one of `list_materials()`, or the path of a TOML file.
-
-    **Returns:** the `Dipole` of a [medium], the `LayeredMultipole` of [[layers]], or the `Skin` of
-    a [skin], in JAX's default precision.
+    **Returns:** the `Dipole` of a [medium] or [openpbr], the `LayeredMultipole` of [[layers]], or
+    the `Skin` of a [skin], in JAX's default precision.
 
     **Raises:** `ValueError` as `load_medium` does.
     """
@@ -242,6 +248,7 @@ def plain_material(
             "unit": VARIANCE_UNIT,
             **plain_record(material.gaussians),
             **({} if profile is None else {"profile": _description(profile)}),
+            **({"coefficients_digest": digest} if (digest := _digest(tables)) else {}),
             **{
                 name: value if isinstance(value, str | int | float) else plain_numbers(value)
                 for name, value in (fit or {}).items()
@@ -290,6 +297,13 @@ def _read(
         with naming(f"{path}: [[layers]]"):
             profile = LayeredMultipole(layers)
     return tables, surface, profile
+
+
+def _digest(tables: Mapping[str, Any]) -> str | None:
+    """Compute a digest of the coefficients among the tables of a material; `None` without any."""
+    optics = {kind: tables[kind] for kind in _KINDS if kind in tables}
+    plain = json.dumps(optics, sort_keys=True).encode()
+    return hashlib.sha256(plain).hexdigest()[:16] if optics else None
 
 
 def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin) -> str:

@@ -183,6 +183,10 @@ def test_a_fit_to_its_own_file_keeps_what_stood_there(tmp_path):
     assert after["source"]["citation"] == "measured by hand"
     assert after["source"]["provenance"].startswith("the third sample; fitted by splatjax")
     assert len(after["fit"]["variances"]) == 2
+    edited = tmp_path / "edited.toml"
+    edited.write_text(path.read_text().replace("0.0021", "0.0022"))
+    with pytest.warns(UserWarning, match="coefficients"):
+        sj.load_material(edited)
     assert max(after["fit"]["error"]) < 0.5  # 1 if no Gaussian is as wide as the profile
     with jax.enable_x64(True):
         assert run("fit", path, "--count", 2, "--output", path) == 0

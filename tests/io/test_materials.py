@@ -22,6 +22,7 @@ from splatjax.io import (
     save_material,
     spectrum_to_rgb,
 )
+from splatjax.io._tables import Table
 from splatjax.scattering import (
     AngularLaw,
     Dipole,
@@ -155,6 +156,32 @@ def test_a_saved_material_comes_back_bit_for_bit(tmp_path, model):
     assert load_mean_cosine(path) == (0.0 if medium is None else 0.75)
     assert f'profile = "{model}, exact Fresnel moments"' in path.read_text()
     assert "\neta = 1.37\n" in path.read_text()  # the shortest number that is read back exactly
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        ("marble", "a = [0.0021", "a = [0.0022"),
+        ("marble", "[angles]", "g = 0.5\n[angles]"),
+        ("skin_layers", "thickness = 0.25", "thickness = 0.26"),
+        ("skin_brown", "melanin = 0.1", "melanin = 0.11"),
+    ],
+)
+def test_coefficients_that_were_edited_after_their_fit_are_reported(tmp_path, name, before, after):
+    """In a file of every kind, unless it has no digest, and in a scene."""
+    text = (profiles_folder() / f"{name}.toml").read_text(encoding="utf-8")
+    path, own = tmp_path / "mine.toml", "coefficients_digest"
+    path.write_text(text, encoding="utf-8")
+    load_material(path)
+    edited = text.replace(before, after, 1)
+    path.write_text(edited, encoding="utf-8")
+    with pytest.warns(UserWarning, match=r"mine\.toml has coefficients .*`splatjax fit \S*mine"):
+        load_material(path)
+    path.write_text(edited.replace(own, "note"), encoding="utf-8")
+    load_material(path)
+    entries = tomllib.loads(edited)
+    with pytest.warns(UserWarning, match=r"a\.toml: \[material\] has coefficients"):
+        load_material(Table(Path("a.toml"), "material", entries, entries))
 
 
 @pytest.mark.parametrize(
