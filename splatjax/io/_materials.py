@@ -1,7 +1,5 @@
 """Materials as TOML files: optical coefficients, their source, and the Gaussians fitted to them."""
 
-import hashlib
-import json
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,9 +29,11 @@ from splatjax.scene import Material
 
 from ._files import StrPath, naming, plain_record, record_names, require
 from ._media import (
+    KINDS,
     LAYER_ENTRIES,
     MEDIUM_ENTRIES,
     OPENPBR_ENTRIES,
+    digest_of,
     layer_of,
     medium_of,
     plain_layer,
@@ -43,8 +43,7 @@ from ._media import (
 from ._tables import Table, nearest, read_toml, write_toml
 
 VARIANCE_UNIT = "mm^2"
-_KINDS = {"medium": "[medium]", "openpbr": "[openpbr]", "layers": "[[layers]]", "skin": "[skin]"}
-MATERIAL_TABLES = (*_KINDS, "surface", "single_scattering", "angles", "source", "fit")
+MATERIAL_TABLES = (*KINDS, "surface", "single_scattering", "angles", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
 # Names in [fit] of profiles whose coefficients are in the file.
 _MODELS: dict[type, str] = {
@@ -96,7 +95,7 @@ def load_material(name_or_path: StrPath | Table) -> Material:
     require("fit" in tables.entries, path, f"has no [fit]; {remedy}")
     fit = tables.table("fit", tables.entries["fit"])
     fit.one_of("unit", [VARIANCE_UNIT])
-    digest = _digest(tables.entries)
+    digest = digest_of(tables.entries)
     if fit.entries.get("coefficients_digest", digest) != digest:
         if tables.name:  # it is a table of a scene
             remedy = "copy it to a file, `splatjax fit` that, and name the result as `material`"
@@ -248,7 +247,7 @@ def plain_material(
             "unit": VARIANCE_UNIT,
             **plain_record(material.gaussians),
             **({} if profile is None else {"profile": _description(profile)}),
-            **({"coefficients_digest": digest} if (digest := _digest(tables)) else {}),
+            **({"coefficients_digest": digest} if (digest := digest_of(tables)) else {}),
             **{
                 name: value if isinstance(value, str | int | float) else plain_numbers(value)
                 for name, value in (fit or {}).items()
@@ -259,6 +258,11 @@ def plain_material(
 
 def _tables(name_or_path: StrPath) -> Table:
     path = material_path(name_or_path)
+    require(
+        path.suffix.lower() != ".mtlx",
+        path,
+        "is MaterialX, which is only written; copy its numbers to [openpbr] in a TOML file",
+    )
     entries = read_toml(path, "check the path, or give a material (`splatjax materials`)")
     require(
         not entries.keys() & {"splats", "camera", "material"},
@@ -274,20 +278,21 @@ def _read(
     """Read the tables of a material, its surface, and its coefficients, if any."""
     tables = material if isinstance(material, Table) else _tables(material)
     path, entries, profile = tables.path, tables.entries, None
-    kinds = [_KINDS[kind] for kind in _KINDS if kind in entries]
+    kinds = [KINDS[kind] for kind in KINDS if kind in entries]
     require(len(kinds) < 2, path, f"has {' and '.join(kinds)}; give one of them")
     require(
-        kinds or "fit" in entries, path, f"has no {', '.join(_KINDS.values())} or [fit]; give one"
+        kinds or "fit" in entries, path, f"has no {', '.join(KINDS.values())} or [fit]; give one"
     )
     entries.setdefault("surface", {})
     table = tables.table("surface", _SURFACE)
+    if "openpbr" in entries:
+        entries["medium"], of_openpbr = plain_openpbr(tables.table("openpbr", OPENPBR_ENTRIES))
+        table.entries.update(of_openpbr | table.entries)
+        del entries["openpbr"]
     surface = {name: table.numbers(name) for name in table.entries}
     table.make(Material, SumOfGaussians([1.0], [[1.0]]), **surface)  # checks them
     roughness = surface.get("roughness")
     table.make(check_values, "roughness", roughness, "in (0, 1]", lambda x: (x > 0) & (x <= 1))
-    if "openpbr" in entries:
-        entries["medium"] = plain_openpbr(tables.table("openpbr", OPENPBR_ENTRIES))
-        del entries["openpbr"]
     if "medium" in entries:
         profile = Dipole(medium_of(tables.table("medium", MEDIUM_ENTRIES)))
     elif "skin" in entries:
@@ -297,13 +302,6 @@ def _read(
         with naming(f"{path}: [[layers]]"):
             profile = LayeredMultipole(layers)
     return tables, surface, profile
-
-
-def _digest(tables: Mapping[str, Any]) -> str | None:
-    """Compute a digest of the coefficients among the tables of a material; `None` without any."""
-    optics = {kind: tables[kind] for kind in _KINDS if kind in tables}
-    plain = json.dumps(optics, sort_keys=True).encode()
-    return hashlib.sha256(plain).hexdigest()[:16] if optics else None
 
 
 def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin) -> str:

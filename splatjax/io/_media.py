@@ -2,6 +2,9 @@
 free path, or pigments.
 """
 
+import hashlib
+import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,7 @@ from splatjax.scattering import Film, HalfSpace, Layer, Medium
 from ._files import plain_record
 from ._tables import Table
 
+KINDS = {"medium": "[medium]", "openpbr": "[openpbr]", "layers": "[[layers]]", "skin": "[skin]"}
 COEFFICIENT_UNIT, THICKNESS_UNIT = "1/mm", "mm"
 _PER_MM = {COEFFICIENT_UNIT: 1.0, "1/cm": 0.1}
 _WAYS = (
@@ -28,7 +32,10 @@ _OPENPBR: dict[str, Any] = {
     "specular_ior": 1.5,
     "subsurface_scatter_anisotropy": 0.0,
 }
-OPENPBR_ENTRIES = "unit", *_OPENPBR
+OPENPBR_ENTRIES = (
+    *("unit", *_OPENPBR),
+    *("subsurface_weight", "specular_weight", "specular_roughness"),
+)
 MEDIUM_ENTRIES = ("unit", "eta", *sorted(set().union(*_WAYS)))
 LAYER_ENTRIES = (*MEDIUM_ENTRIES, "optical_depth", "thickness", "thickness_unit")
 
@@ -57,12 +64,24 @@ def medium_of(table: Table) -> Medium:
     return table.make(Medium, sigma_a, factor * table.numbers(reduced), eta)
 
 
-def plain_openpbr(table: Table) -> dict[str, Any]:
-    """Translate the table of an OpenPBR material to a [medium]."""
+def plain_openpbr(table: Table) -> tuple[dict[str, Any], dict[str, float]]:
+    """Translate the table of an OpenPBR material to a [medium] and the given part of a
+    [surface].
+    """
+    table.require(
+        table.number("subsurface_weight", 1.0) == 1,
+        "subsurface_weight must be 1; mixtures with an opaque surface are not supported",
+    )
+    surface = {}
+    if "specular_weight" in table.entries:
+        surface["specular"] = table.number("specular_weight")
+    if "specular_roughness" in table.entries:
+        surface["roughness"] = table.number("specular_roughness") ** 2
     per_unit = _MM[table.one_of("unit", _MM)]
     color, radius, scale, eta, g = (table.numbers(*entry) for entry in _OPENPBR.items())
     medium = {"color": color, "mean_free_path": per_unit * radius * scale, "eta": eta, "g": g}
-    return {"unit": THICKNESS_UNIT, **{name: values.tolist() for name, values in medium.items()}}
+    plain = {name: values.tolist() for name, values in medium.items()}
+    return {"unit": THICKNESS_UNIT, **plain}, surface
 
 
 def layer_of(table: Table) -> Layer | Film:
@@ -89,3 +108,10 @@ def plain_layer(layer: Layer | Film) -> dict[str, Any]:
         return plain_record(layer)
     thickness = plain_record(layer, medium=None)
     return {**thickness, "thickness_unit": THICKNESS_UNIT, **plain_medium(layer.medium)}
+
+
+def digest_of(tables: Mapping[str, Any]) -> str | None:
+    """Compute a digest of the coefficients among the tables of a material; `None` without any."""
+    optics = {kind: tables[kind] for kind in KINDS if kind in tables}
+    plain = json.dumps(optics, sort_keys=True).encode()
+    return hashlib.sha256(plain).hexdigest()[:16] if optics else None

@@ -3,6 +3,7 @@
 import runpy
 import tomllib
 from pathlib import Path
+from xml.etree import ElementTree
 
 import equinox as eqx
 import jax
@@ -20,7 +21,10 @@ from splatjax.io import (
     load_profile,
     profiles_folder,
     save_material,
+    save_materialx,
     spectrum_to_rgb,
+    surface_and_source,
+    write_toml,
 )
 from splatjax.io._tables import Table
 from splatjax.scattering import (
@@ -191,6 +195,7 @@ def test_coefficients_that_were_edited_after_their_fit_are_reported(tmp_path, na
         (load_material, "Skin", "Skin: .* did you mean 'skin'"),
         (load_material, "xyzzy", "xyzzy: .* known are apple, cappuccino_powder"),
         (load_material, Path("none.toml"), r"none.toml: cannot be read \(No such file"),
+        (load_profile, "stone.mtlx", r"stone.mtlx: .*\[openpbr\]"),
         (load_medium, "skin", r"skin.toml: has no \[medium\]"),
         (load_medium, "skin_layers", r"has no \[medium\], only its layers"),
     ],
@@ -269,6 +274,10 @@ BAD = [
         r"single_scattering has 2 channels, .* has 1",
     ),
     (GOOD_FIT + "[surface]\nroughness = 1.5\n", r"\[surface\].*roughness .* 1\.5$"),
+    (
+        '[openpbr]\nunit = "mm"\nsubsurface_weight = 0.5\n',
+        r"\[openpbr\] subsurface_weight must be 1",
+    ),
     ("[skin]\nmelanin = 2.0\n", r"\[skin\]: Skin.melanin must be between 0 and 1; got 2"),
     ("[skin]\nmelanine = 0.1\n", r"\[skin\] has an unknown entry 'melanine'; did you mean"),
     ("[skin]\nblood = [0.1, 0.2]\n", r"\[skin\] blood must be one number"),
@@ -302,3 +311,23 @@ def test_the_subsurface_of_openpbr_comes_in_with_its_defaults_and_its_color_goes
         for sigma_a in (medium.sigma_a, 0 * medium.sigma_a)
     )
     np.testing.assert_allclose(found / white, color, rtol=2e-2)  # of float32
+
+
+def test_an_exported_openpbr_surface_comes_back_with_its_highlight(tmp_path):
+    """Its inputs, as [openpbr], give its surface and coefficients; [surface] takes precedence."""
+    marble = load_material("marble")
+    surface = {"eta": marble.eta, "specular": 0.7, "roughness": 0.16}
+    material = sj.Material(marble.gaussians, medium=marble.medium, **surface)
+    save_materialx(tmp_path / "it.mtlx", material)
+    inputs = ElementTree.parse(tmp_path / "it.mtlx").find("open_pbr_surface").findall("input")
+    numbers = {i.get("name"): [*map(float, i.get("value").split(","))] for i in inputs}
+    entries = {name: v if len(v) > 1 else v[0] for name, v in numbers.items()}
+    write_toml(tmp_path / "it.toml", {"openpbr": {"unit": "mm", **entries}})
+    found, _ = surface_and_source(tmp_path / "it.toml")
+    np.testing.assert_allclose([found["specular"], found["roughness"]], [0.7, 0.16], rtol=1e-6)
+    medium = load_medium(tmp_path / "it.toml")
+    np.testing.assert_allclose(medium.sigma_s_prime, marble.medium.sigma_s_prime, rtol=1e-3)
+    write_toml(
+        tmp_path / "it.toml", {"openpbr": {"unit": "mm", **entries}, "surface": {"roughness": 0.5}}
+    )
+    assert surface_and_source(tmp_path / "it.toml")[0]["roughness"] == 0.5
