@@ -16,14 +16,20 @@ import tyro
 
 import splatjax as sj
 
-from ._scene import camera_of, draw, identified, rough_picture, scene_contents
+from ._scene import (
+    camera_of,
+    draw,
+    identified,
+    note_unresolved,
+    rough_picture,
+    scene_contents,
+)
 from ._terminal import (
     Rules,
     check_folder,
     check_options,
     check_output,
     complete,
-    note,
     option_name,
     preview,
     process_index_and_count,
@@ -34,7 +40,6 @@ from ._view import ViewOptions
 _LARGEST = 16_383  # pixels along a side of a WebP file
 _MOST_FRAMES = 10_000  # the most that four digits can number
 _NOT_IN_PICTURES = ("splats", "output", "fps", "quiet", "half", "camera_file", "camera_unit")
-_note_once = functools.cache(note)
 _DIRECTIONS = 128  # number of shadow maps of an environment that turns about the body
 
 
@@ -61,14 +66,15 @@ class PictureOptions(ViewOptions):
         self,
         path: Path,
         frame: sj.Frame,
-        material: sj.Material,
-        lights: tuple[sj.scene.AbstractLight, ...],
+        scene: sj.Scene,
         camera: sj.Camera,
         settings: sj.RenderSettings,
+        count: int | None = None,  # of all splats, if the scene has a part of them
     ) -> tuple[Path, Path]:
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
+        material, lights = scene.material, scene.lights
         picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
-        scene = scene_contents(self, settings, path.parent, material, lights, camera)
+        contents = scene_contents(self, settings, path.parent, material, lights, camera)
         # The sum of all layers belongs to no Gaussian.
         is_summed = isinstance(
             settings.diffuser, sj.diffusion.ExitanceDiffuser | sj.diffusion.ShapeDiffuser
@@ -78,17 +84,12 @@ class PictureOptions(ViewOptions):
             path,
             frame,
             variances=widths,
-            manifest=self.manifest() | {"scene": scene},
+            manifest=self.manifest() | {"scene": contents},
             camera=camera,
             half=self.half,
         )
-        unresolved = np.asarray(frame.unresolved_fraction) > 0.5
-        if widths and self.scattering and unresolved.any():
-            deviations = ", ".join(f"{width:.3g}" for width in np.sqrt(widths)[unresolved])
-            _note_once(
-                "unresolved, because they are narrower than the splats: Gaussians of standard "
-                f"deviations {deviations} mm; more splats resolve them, or a smaller body (scale)"
-            )
+        if widths and self.scattering:
+            note_unresolved(frame, scene, settings.kernel, count or scene.splats.count)
         if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
             shown = np.asarray(lights[0].behind(frame, camera))
         elif self.background == "transparent":
@@ -175,7 +176,7 @@ class Render(PictureOptions):
         else:
             scene, camera, settings = self.open()
             frame = self._drawn(scene, camera, settings)
-            pictured = frame, scene.material, scene.lights, camera, settings
+            pictured = frame, scene, camera, settings
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
             written = self.write(self.output, *pictured)
         print(*written, sep="\n")
@@ -204,13 +205,13 @@ class Render(PictureOptions):
 
         with stage(f"reading {file.count} splats"):
             camera = self.camera(parts, self.azimuth)
-        material = self.material_for(next(iter(parts())))
+        material = self.material_for(first := next(iter(parts())))
         lights = self.lights(material, self.azimuth, self.single_light[0])
         with stage("rendering the stream", file.count) as report:
             frame = sj.render_streamed(
                 parts, lights, material, camera, report=lambda task, done: report(done, task)
             )
-        return frame, material, lights, camera, self.settings
+        return frame, sj.Scene(first, lights, material), camera, self.settings, file.count
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -324,6 +325,6 @@ class Turntable(PictureOptions):
 
         def make(i: int) -> None:
             frame = draw(scenes[i], cameras[i], settings, plan, light)
-            self.write(paths[i][0], frame, material, scenes[i].lights, cameras[i], settings)
+            self.write(paths[i][0], frame, scenes[i], cameras[i], settings)
 
         return make

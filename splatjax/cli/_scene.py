@@ -2,6 +2,7 @@
 of a scene.
 """
 
+import functools
 import math
 import os
 from collections.abc import Sequence
@@ -13,6 +14,10 @@ import jax
 import numpy as np
 
 import splatjax as sj
+
+from ._terminal import note
+
+_note_once = functools.cache(note)
 
 
 def camera_of(source: str, mm_per_unit: float, up: str, height: int, scale: float) -> sj.Camera:
@@ -83,6 +88,25 @@ def draw(
             "is needed"
         )
     return frame
+
+
+def note_unresolved(frame: sj.Frame, scene: sj.Scene, kernel: Any, count: int) -> None:
+    """Note the layers that the splats do not resolve, and how many splats would resolve the widest
+    of them. The splats of the scene may be a part of the `count` splats of the frame.
+    """
+    unresolved = np.asarray(frame.unresolved_fraction) > 0.5
+    if not unresolved.any():
+        return
+    deviations = np.sqrt(scene.material.gaussians.variances)[unresolved]
+    interval = np.asarray(kernel.interval(sj.diffusion.unevenness(scene.splats)))
+    # In the middle of the interval, in variance, half of a layer is resolved.
+    needed = count * np.mean(scene.splats.areas) * np.mean(interval**2) / deviations[-1] ** 2
+    widths = ", ".join(f"{width:.3g}" for width in deviations)
+    _note_once(
+        "unresolved, because they are narrower than the splats: Gaussians of standard deviations "
+        f"{widths} mm; about {float(f'{needed:.2g}'):,.0f} splats of this body (--count) resolve "
+        f"the one of {deviations[-1]:.3g} mm"
+    )
 
 
 def rough_picture(

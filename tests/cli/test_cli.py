@@ -22,6 +22,7 @@ from PIL import Image
 import splatjax as sj
 from splatjax.cli._main import prepare_jax
 from splatjax.cli._render import Render
+from splatjax.cli._scene import note_unresolved
 from splatjax.cli._view import direction_to
 
 SMALL = ["--count", "400", "--width", "32", "--height", "32", "--light-azimuth", "-20"]
@@ -138,6 +139,22 @@ def test_render_shows_the_bust_and_its_manifest_makes_the_same_picture(plain, tm
     assert run("render", again, "--output", third) == 0
     for picture in map(sj.read_exr, (again, third)):
         assert eqx.tree_equal(picture, frame)
+
+
+def test_the_number_of_splats_that_would_resolve_a_layer_is_noted(capsys):
+    """With the number that is noted, about half of the layer is resolved."""
+    material = sj.Material(sj.SumOfGaussians([4.0, 40.0], [[0.5], [0.5]]), eta=1.0)
+    light, camera = sj.DirectionalLight([0, 0, -1], 3.0), bodies.view((0.0, 0.0, 80.0), size=24)
+
+    def fraction(count):
+        scene = sj.Scene(bodies.sphere(count, 20.0, jitter=1.0), light, material)
+        frame = sj.render(scene, camera)
+        note_unresolved(frame, scene, sj.RenderSettings().kernel, count)
+        return float(frame.unresolved_fraction[0])
+
+    assert fraction(800) > 0.9
+    (needed,) = re.findall(r"of standard deviations 2 mm; about ([\d,]+) ", capsys.readouterr().err)
+    assert fraction(int(needed.replace(",", ""))) == pytest.approx(0.5, abs=0.1)
 
 
 @pytest.mark.parametrize("albedo", [True, False])
