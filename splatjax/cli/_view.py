@@ -28,6 +28,7 @@ from ._terminal import (
 
 # Degrees: the fill is beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
+_WHITE = 0.995  # least reflectance of a material that counts as white
 # Options of the single light, with their defaults if another of them is given.
 _SINGLE_LIGHT = {"light_azimuth": -20.0, "light_elevation": 30.0, "fill": 0.1}
 # Options that are given beside a scene's file.
@@ -205,12 +206,20 @@ class ViewOptions:
                 "splats carry albedo; give --no-albedo"
             )
         material = sj.load_material(self.material)
+        is_white = float(material.total_reflectance().min()) > _WHITE
         if splats.albedo is not None:
             material = material.white()
-        if splats.albedo is not None and self.scattering:
+            remedy = "" if is_white else "; --no-albedo gives the color of the material"
+            if self.scattering:
+                note(
+                    f"the color is the albedo of the splats, and {self.material} only spreads the "
+                    f"light{remedy}"
+                )
+        elif is_white:
             note(
-                f"the color is the albedo of the splats, and {self.material} only spreads the "
-                "light; --no-albedo gives the color of the material"
+                f"{self.material} has no color of its own, and the splats no albedo, so the body "
+                "is white; give --material skin_light, skin1 or marble (`splatjax materials` "
+                "lists more), or splats with albedo"
             )
         if material.channels == 1:  # the same weights for red, green and blue
             tiled = jax.tree.map(lambda leaf: jnp.tile(leaf, 3) if leaf.ndim else leaf, material)

@@ -169,6 +169,17 @@ def test_color_is_of_the_albedo_or_of_the_material(albedo, tmp_path, capsys):
     assert ("--no-albedo" in capsys.readouterr().err) == albedo
 
 
+@pytest.mark.parametrize(("albedo", "named"), [(True, "only spreads"), (False, "skin_light")])
+def test_a_white_material_is_no_color(albedo, named, tmp_path, capsys):
+    path = tmp_path / "painted.ply"
+    bare = sj.read_splats(plate(path))
+    sj.write_splats(path, bodies.with_albedo(bare, jnp.full_like(bare.centers, 0.5)))
+    Render(splats=path, material="skin", albedo=albedo).load()
+    (line,) = re.findall(r".*\bskin\b.*", capsys.readouterr().err)
+    assert named in line
+    assert "--no-albedo" not in line
+
+
 def test_a_material_of_one_channel_has_three(tmp_path):
     marble, path = sj.load_material("marble"), tmp_path / "gray.toml"
     gray = jax.tree.map(lambda leaf: leaf[..., :1] if leaf.shape[-1:] == (3,) else leaf, marble)
