@@ -50,9 +50,10 @@ class Recover:
         direction = [1, -0.3, -0.5]
         irradiance = [3.14, 3.14, 3.14]
 
-    Other kinds of lights are "point" (position, intensity), "beam" (origin, direction, power,
-    variance), and "rectangle" (center, edges, radiance), "disk" (center, direction, radius,
-    radiance) and "sphere" (center, radius, radiance).
+    Other kinds of lights are "point" (position, intensity), "spot" (position, direction,
+    intensity), "beam" (origin, direction, power, variance), "rectangle" (center, edges, radiance),
+    "disk" (center, direction, radius, radiance), "sphere" (center, radius, radiance) and
+    "environment" (image).
 
     The albedo of the splats is not used: the coefficients give all color. After an interruption,
     run the same command again; it continues from the best medium so far.

@@ -10,6 +10,8 @@ from splatjax._display import srgb_to_linear
 from splatjax._records import check_installed
 from splatjax.geometry import estimate_normals
 
+from ._files import require
+
 _PLACES, _COLORS = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _TURNS = ("rot_1", "rot_2", "rot_3", "rot_0")  # the real part last
@@ -50,8 +52,7 @@ def surface_columns(
             for names in (_PLACES, _COLORS, _SCALES, _TURNS)
         )
         scales = np.exp(scales)
-    if not is_kept.any():
-        raise ValueError(f"{path}: no Gaussian has an opacity of {opacity:g}; give a lower opacity")
+    require(is_kept.any(), path, f"no Gaussian has an opacity of {opacity:g}; give a lower opacity")
     axes = Rotation.from_quat(turns).as_matrix()
     normals = axes[np.arange(len(axes)), :, scales.argmin(axis=1)]
     is_inward = np.sum(normals * estimate_normals(centers), axis=1) < 0

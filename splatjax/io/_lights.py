@@ -42,6 +42,7 @@ from ._tables import Table, read_toml
 from ._trimesh import one_sentence
 
 PLACE = ("position", "target", "up", "fov")
+_UPRIGHT = None, None, [0.0, 1.0, 0.0]  # defaults of the vectors in PLACE
 _MOST_ROWS = 512  # largest number of rows of an environment
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
 ENVIRONMENTS = {"studio": studio, "overcast": overcast_sky, "sun": sun_and_sky}
@@ -143,9 +144,11 @@ def read_observations(path: StrPath) -> list[Observation]:
     A camera may have `up`. Other kinds of lights are "point" (`position` in mm, `intensity`,
     `cast_shadows`), "spot" (a point light with `direction`, `inner_angle` and `outer_angle` in
     degrees), "beam" (`origin`, `direction`, `power`, `variance` in mm^2), "rectangle" (`center`,
-    `radiance`, `edges`), "disk" (`center`, `radiance`, `direction`, `radius`) and "sphere"
-    (`center`, `radiance`, `radius`; all three `cast_shadows`). Color is one number per channel, or
-    one for all.
+    `radiance`, `edges`), "disk" (`center`, `radiance`, `direction`, `radius`), "sphere" (`center`,
+    `radiance`, `radius`; all three `cast_shadows`) and "environment" (`image`: studio, overcast,
+    sun, or a file; `rotation`, `strength`, `up`). In place of the `direction` of a spot, beam or
+    disk there may be a `target`, the point that it faces; in place of the `edges` of a rectangle a
+    `target`, `width` and `height`. Color is one number per channel, or one for all.
 
     **Returns:** an `Observation` for each picture, in JAX's default precision.
 
@@ -196,10 +199,12 @@ def _observation(table: Table) -> Observation:
 
 def look_at(table: Table, width: int, height: int) -> Camera:
     """Make a camera from a table of position, target, up and field of view."""
-    vectors = [table.numbers(name).tolist() for name in ("position", "target")]
-    up = table.numbers("up", [0.0, 1.0, 0.0]).tolist()
+    vectors = [table.numbers(n, d).tolist() for n, d in zip(PLACE, _UPRIGHT, strict=False)]
+    for name, vector in zip(PLACE, vectors, strict=False):
+        table.require(np.shape(vector) == (3,), f"{name} must be three numbers; it is {vector}")
+    *points, up = vectors
     return table.make(
-        Camera.look_at, *vectors, up=up, fov=table.number("fov", 25.0), width=width, height=height
+        Camera.look_at, *points, up=up, fov=table.number("fov", 25.0), width=width, height=height
     )
 
 

@@ -50,14 +50,14 @@ def medium_of(table: Table) -> Medium:
         f"has {', '.join(sorted(names)) or 'no coefficients'}; give sigma_a and sigma_s_prime, or "
         "sigma_a, sigma_s and g, or color and mean_free_path",
     )
+    unit = table.one_of("unit", [THICKNESS_UNIT] if "color" in names else _PER_MM)
     eta, g = table.numbers("eta"), table.number("g", 0.0)
     between = "between -1 and 1, both excluded"
     table.make(check_values, "g", np.asarray(g), between, lambda x: abs(x) < 1)
     if "color" in names:
-        table.one_of("unit", [THICKNESS_UNIT])
         color, mean_free_path = table.numbers("color"), table.numbers("mean_free_path")
         return table.make(HalfSpace.of_color, color, mean_free_path, eta, g).medium
-    per_mm, reduced = _PER_MM[table.one_of("unit", _PER_MM)], "sigma_s_prime"
+    per_mm, reduced = _PER_MM[unit], "sigma_s_prime"
     sigma_a, factor = per_mm * table.numbers("sigma_a"), per_mm
     if "sigma_s" in names:
         reduced, factor = "sigma_s", per_mm * (1 - g)

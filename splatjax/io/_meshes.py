@@ -192,10 +192,11 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
             if np.size(table.get("faces", ()))
         }
         read = sum(len(piece.mesh.faces) for piece in pieces.values())
-        if content["triangles"] not in (None, read):
-            raise ValueError(
-                f"{content['triangles']} triangles were expected, and {read} were read"
-            )
+        require(
+            content["triangles"] in (None, read),
+            path,
+            f"{content['triangles']} triangles were expected, and {read} were read; re-export it",
+        )
         # Parents come before their children.
         world, placed = {content.get("base_frame"): np.eye(4)}, []
         for node in content.get("graph", [{"geometry": name} for name in pieces]):

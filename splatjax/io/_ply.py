@@ -183,8 +183,11 @@ class SplatFile:
             elements, is_text, _ = _parse_header(file)
             name, vertices = next(iter(elements.items()))
             kinds = vertices["properties"]
-            if is_text or name != "vertex" or any("LIST" in kind for kind in kinds.values()):
-                raise ValueError("its vertices are not the first element, in binary without lists")
+            require(
+                not is_text and name == "vertex" and not any("LIST" in k for k in kinds.values()),
+                path,
+                f"its vertices are not the first element, in binary without lists; {_COMPLETE}",
+            )
             self.count, self._offset = vertices["length"], file.tell()
             self._names, self._columns = tuple(kinds), np.dtype(list(kinds.items()))
             self._rows(0, self.count)  # raises where the file is cut short

@@ -29,12 +29,10 @@ Made = TypeVar("Made")
 def read_toml(path: Path, remedy: str) -> dict[str, Any]:
     """Read all tables of a TOML file.
 
-    **Raises:** `ValueError` when it cannot be read.
+    **Raises:** `OSError` when it cannot be opened, `ValueError` when it is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+        return tomllib.loads(existing_file(path).read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: is not a TOML file ({error}); {remedy}") from None
 
@@ -79,9 +77,11 @@ class Table:
     def one_of(self, name: str, choices: Iterable[Any], default: Any = None) -> Any:
         """Return an entry that is one of some choices."""
         value = self.entries.get(name, default)
+        near = difflib.get_close_matches(str(value).lower(), map(str, choices), n=1)
         self.require(
             (type(value), value) in [(type(choice), choice) for choice in choices],
-            f"{name} must be {' or '.join(map(repr, choices))}; it is {value!r}",
+            f"{name} must be {' or '.join(map(_as_toml, choices))}; it is {_as_toml(value)}"
+            f"{f'; did you mean {near[0]!r}?' if near else ''}",
         )
         return value
 
@@ -95,9 +95,10 @@ class Table:
         if kinds and kinds <= {int, float}:
             with suppress(TypeError, ValueError, OverflowError):  # rows of several lengths
                 return jnp.asarray(rounded(value))
+        self.require(value is not None, f"{name} is missing; add it")
         raise ValueError(
             f"{self.where} {name} must be a number, a list of numbers or rows of equal length; it "
-            f"is {'missing' if value is None else repr(value)}"
+            f"is {_as_toml(value)}"
         )
 
     def number(self, name: str, default: float | None = None) -> float:
@@ -147,6 +148,10 @@ def write_toml(path: StrPath, tables: Mapping[str, Any]) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def _as_toml(value: Any) -> str:
+    return {"True": "true", "False": "false", "None": "missing"}.get(repr(value), repr(value))
+
+
 def nearest(name: str, choices: Iterable[str]) -> str:
     """Suggest the known name that is nearest to an unknown one, or list all of them."""
     choices = sorted(choices)
@@ -170,18 +175,14 @@ def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
     channel.
 
     Empty lines and lines that begin with `#` are ignored. The first line may contain names; a unit
-    of length in it must agree with `mm_per_unit`. Radii ascend.
+    in it must agree with `mm_per_unit`. Radii ascend.
 
-    **Arguments:**
-
-    - `path`: path of the file.
-    - `mm_per_unit`: length of the file's unit, mm. Radii are in this unit, and values per square of
-      this unit.
+    **Arguments:** `mm_per_unit`: length of the file's unit, mm. Radii are in this unit, and values
+    per square of this unit.
 
     **Returns:** a `Tabulated` in JAX's default precision, mm and 1/mm^2.
 
-    **Raises:** `FileNotFoundError`, and `ValueError`, with file, line and cause, if the file is not
-    such a table.
+    **Raises:** `FileNotFoundError`, and `ValueError`, with line and cause, for another content.
     """
     check_units(path, mm_per_unit)
     rows = _read_rows(path, "a profile is a CSV of radii and values")
@@ -189,11 +190,12 @@ def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
         (where, names), *rows = rows
         for unit, size in _MM.items():
             is_named = re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", ",".join(names))
-            if is_named and not np.isclose(size, mm_per_unit, rtol=1e-6, atol=0):
-                raise ValueError(
-                    f"{where} gives the unit {unit}, and mm_per_unit is {mm_per_unit:g}; give "
-                    f"mm_per_unit = {size:g} (--mm-per-unit {size:g}), or correct the unit"
-                )
+            require(
+                not is_named or np.isclose(size, mm_per_unit, rtol=1e-6, atol=0),
+                where,
+                f"gives the unit {unit}, and mm_per_unit is {mm_per_unit:g}; give mm_per_unit = "
+                f"{size:g} (--mm-per-unit {size:g}), or correct the unit",
+            )
     require(len(rows) >= 2, path, f"has {len(rows)} lines of numbers; give at least two radii")
     table, count = [], len(rows[0][1])
     for where, cells in rows:
@@ -220,8 +222,7 @@ def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
 
     **Returns:** the names (numbers if there are none), and the three coefficients of each medium.
 
-    **Raises:** `FileNotFoundError`, and `ValueError`, with file, line and cause, if the file is not
-    such a table.
+    **Raises:** `FileNotFoundError`, and `ValueError`, with line and cause, for another content.
     """
     contents = f"media are a CSV of {', '.join(_COLUMNS)}"
     (_, head), *rows = _read_rows(path, contents) or [("", [])]

@@ -194,7 +194,6 @@ def test_coefficients_that_were_edited_after_their_fit_are_reported(tmp_path, na
         (load_material, "marbel", "marbel: .* did you mean 'marble'"),
         (load_material, "Skin", "Skin: .* did you mean 'skin'"),
         (load_material, "xyzzy", "xyzzy: .* known are apple, cappuccino_powder"),
-        (load_material, Path("none.toml"), r"none.toml: cannot be read \(No such file"),
         (load_profile, "stone.mtlx", r"stone.mtlx: .*\[openpbr\]"),
         (load_medium, "skin", r"skin.toml: has no \[medium\]"),
         (load_medium, "skin_layers", r"has no \[medium\], only its layers"),
@@ -202,6 +201,8 @@ def test_coefficients_that_were_edited_after_their_fit_are_reported(tmp_path, na
 )
 def test_what_is_not_there(load, name, value):
     assert_refused(lambda: load(name), value)
+    with pytest.raises(FileNotFoundError, match=r"none\.toml: there is no such file"):
+        load(Path("none.toml"))
 
 
 def layered(*tables: str) -> str:
@@ -252,7 +253,11 @@ BAD = [
     (COLOR.replace("0.8", "1.8"), r"\[medium\].*color must be between .* 1.8"),
     (COLOR.replace('"mm"', '"1/mm"'), r"\[medium\] unit must be 'mm'; it is '1/mm'"),
     (GOOD_MEDIUM.replace("1/mm", "mm"), r"\[medium\] unit must be '1/mm' or '1/cm'; it is 'mm'"),
-    (GOOD_MEDIUM.replace('unit = "1/mm"\n', ""), r"\[medium\] unit must be .*; it is None"),
+    (GOOD_MEDIUM.replace('unit = "1/mm"\n', ""), r"\[medium\] unit must be .*; it is missing"),
+    (
+        GOOD_MEDIUM.replace("eta = 1.3\n", "").replace("1/mm", "1/cn"),
+        "unit .*; did you mean '1/cm'",
+    ),
     (GOOD_MEDIUM.replace("eta = 1.3\n", ""), r"\[medium\] eta .* missing"),
     (GOOD_MEDIUM, r"has no \[fit\]"),
     (GOOD_MEDIUM.replace("eta", "=eta"), r"TOML file"),
