@@ -125,6 +125,12 @@ class Export:
             with stage(f"loading {self.source}"):
                 scene, camera, _ = sj.io.load_scene(self.source)
                 mesh = sj.io.mesh_of_scene(sj.io.scene_table(self.source))
+            if mesh is None:
+                note(
+                    f"the body is a hexagon for each of its {scene.splats.count} splats, which are "
+                    "not closed, so that light cannot scatter below its surface in other "
+                    "renderers; give a scene whose [splats] has `mesh` in place of `file`"
+                )
             save(
                 self.output,
                 scene,

@@ -61,7 +61,8 @@ def scene_contents(
     def moved(name: str) -> str:
         return name if name in sj.io.ENVIRONMENTS else os.path.relpath(old / name, folder)
 
-    body = body | {key: moved(body[key]) for key in ("file", "mesh") if key in body}
+    names = ("file", "mesh", "albedo", "normal", "specular")
+    body = body | {name: moved(body[name]) for name in names if isinstance(body.get(name), str)}
     tables = [
         sj.io.plain_light(light, moved(image)) for light, image in zip(lights, images, strict=True)
     ]

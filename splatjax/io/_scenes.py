@@ -29,7 +29,8 @@ DIFFUSERS = {
     "shape": ShapeDiffuser(),
 }
 _TABLES = ("material", "splats", "camera", "lights", "settings")
-_BODY = ("file", "mesh", "bust", "count", "mm_per_unit", "up", "scale", "albedo")
+_MAPS = ("albedo", "normal", "specular")
+_BODY = ("file", "mesh", "bust", "count", "mm_per_unit", "up", "scale", "v_up", *_MAPS)
 _CAMERA = {*PLACE, *record_names(Camera), "file", "name", "mm_per_unit"}
 
 
@@ -39,6 +40,7 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
         material = "marble"          # a name, or a file beside this one; or the tables of a file
         [splats]
         file = "head.ply"            # or mesh = "head.glb", count and mm_per_unit; or bust = 200000
+                                     # a mesh may have albedo = "color.jpg", normal, specular, v_up
         up = "y"                     # optional, as are scale = 1.0 and albedo = true
         [camera]
         position = [0, 0, 620]       # mm; target, up, and the vertical fov in degrees
@@ -183,17 +185,25 @@ def _splats(table: Table) -> Splats:
         count, (body, unit) = int(table.number("count", 200_000.0)), _body(table)
         is_mesh = "mesh" in table.entries
         splats = sample_mesh(body, count, **unit) if is_mesh else read_splats(body, **unit)
-    scale, albedo = table.number("scale", 1.0), table.one_of("albedo", (True, False), True)
+    scale, has_map = table.number("scale", 1.0), isinstance(table.entries.get("albedo"), str)
+    albedo = has_map or table.one_of("albedo", (True, False), True)
     splats = splats if scale == 1 else splats.scaled(scale)
     return splats if albedo else splats.without_maps()
 
 
 def _body(table: Table) -> tuple[Path, dict[str, Any]]:
-    """Return the file of a body, with its unit and upward axis."""
+    """Return the file of a body, with its unit and upward axis, and the maps of a mesh."""
     is_mesh = "mesh" in table.entries
     unit = table.number("mm_per_unit", None if is_mesh else 1.0)
     path = table.folder / table.text("mesh" if is_mesh else "file")
-    return path, {"mm_per_unit": unit, "up": table.entries.get("up", "y")}
+    v_up = {"v_up": table.one_of("v_up", (True, False))} if "v_up" in table.entries else {}
+    maps: dict[str, Any] = v_up | {
+        name: table.folder / table.text(name)
+        for name in _MAPS
+        if not isinstance(table.entries.get(name, True), bool)
+    }
+    table.require(is_mesh or not maps, f"{', '.join(maps)}: maps are only for a mesh")
+    return path, {"mm_per_unit": unit, "up": table.entries.get("up", "y"), **maps}
 
 
 def _camera(table: Table) -> Camera:

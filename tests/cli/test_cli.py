@@ -73,6 +73,14 @@ def test_export_writes_a_scene_with_its_mesh(splats, height, tmp_path):
     assert written.is_watertight
 
 
+def test_export_notes_that_splats_are_no_closed_body(tmp_path, capsys):
+    plate(tmp_path / "plate.ply")
+    for splats, is_noted in (({"file": "plate.ply"}, True), ({"bust": 50}, False)):
+        sj.io.write_toml(tmp_path / "it.toml", tomllib.loads(EXPORTED) | {"splats": splats})
+        assert run("export", tmp_path / "it.toml", "--output", tmp_path / "it.glb") == 0
+        assert ("`mesh`" in capsys.readouterr().err) == is_noted
+
+
 def test_sample_covers_a_mesh_that_may_have_z_up(tmp_path, capsys):
     """A box that is tall along z stands upright; its edges are hard up to an angle."""
     mesh, output = tmp_path / "box.stl", tmp_path / "box.ply"

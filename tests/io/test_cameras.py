@@ -16,12 +16,22 @@ import numpy as np
 import pytest
 import trimesh
 from bodies import assert_refused, unit
+from PIL import Image
+from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 from test_refusals import refused, write_any
-from writers import some_frame, some_splats
+from writers import export, some_frame, some_splats, square
 
 import splatjax as sj
-from splatjax.io import load_cameras, load_lights, load_scene, save_scene
+from splatjax.io import (
+    load_cameras,
+    load_lights,
+    load_scene,
+    mesh_of_scene,
+    save_scene,
+    save_usd,
+    scene_table,
+)
 from splatjax.splatting import PerspectiveView
 
 FILES = Path(__file__).parent / "cameras"
@@ -260,6 +270,28 @@ def test_a_scene_by_hand_names_files_beside_it(by_hand):
     assert eqx.tree_equal(camera, replace(expected, width=320, height=240), **CLOSE)
 
 
+def test_a_mesh_of_a_scene_has_maps(by_hand):
+    """The map, red above blue, is the color of the splats and of the exported mesh."""
+    export(square(), by_hand.parent, "obj")
+    Image.fromarray(np.uint8([[[255, 0, 0]]] * 8 + [[[0, 0, 255]]] * 8)).save(
+        by_hand.with_name("map.png")
+    )
+    text = BY_HAND.replace("body/box.stl", "a.obj").replace('"z"', '"y"\nalbedo = "map.png"')
+    for more, above in (("", 0), ("\nv_up = false", 2)):
+        write_any(by_hand, text.replace("[camera]", f"{more}\n[camera]"))
+        scene, camera, _ = load_scene(by_hand)
+        heights = np.asarray(scene.splats.centers)[:, 1]
+        colors = np.asarray(scene.splats.albedo)[(heights > 12) & (heights < 19)]
+        np.testing.assert_allclose(colors[:, above], 1.0, atol=1e-3)
+        mesh = mesh_of_scene(scene_table(by_hand))
+        save_usd(exported := by_hand.with_name(f"{above}.usda"), scene, camera, mesh=mesh)
+        stage = Usd.Stage.Open(str(exported))
+        body = UsdGeom.Mesh.Get(stage, "/scene/body")
+        heights = np.asarray(body.GetPointsAttr().Get())[:, 1]
+        colors = np.asarray(body.GetDisplayColorAttr().Get())[heights > heights.mean()]
+        assert np.all(colors[:, above] > 0.5)
+
+
 AIMED = """[[lights]]
 kind = "rectangle"
 center = [-60, 50, 60]
@@ -324,6 +356,15 @@ def test_lights_may_face_a_target(by_hand, tmp_path):
         ('"overcast"', '"fog.exr"', "fog.exr"),
         ("[[lights]]", "[settings]\nbounces = -1\n[[lights]]", "[settings]"),
         ("[[lights]]", '[settings]\ndiffusion = "dipole"\n[[lights]]', "diffusion must be"),
+        ("count = 60", "count = 60\nalbedo = 1", "albedo must be a name in quotes; it is 1"),
+        ("count = 60", 'count = 60\nnormal = "none.png"', "none.png"),
+        ("mesh =", "v_up = true\nfile =", "[splats] v_up: maps are only for a mesh"),
+        ('"overcast"', '"overcst"', "did you mean 'overcast'"),
+        (
+            'file = "cameras/colmap"\nname',
+            "position = [0, 9]\ntarget = 0\nname",
+            "position must be",
+        ),
         ("[[lights]]", "[lights]", "lights must be one table or more"),
     ],
 )
