@@ -19,6 +19,7 @@ from ._terminal import (
     OptionalFloat,
     OptionalPath,
     UpAxis,
+    check_options,
     check_output,
     check_unused,
     note,
@@ -231,8 +232,15 @@ class Sample:
 
     def run(self) -> None:
         check_output(self.output, (".ply",))
-        if (self.share is None) != (self.second is None):
-            raise ValueError("give --share, a map, and --second, a material, or neither")
+        check_options(
+            self,
+            {
+                "second": (
+                    (self.share is None) == (self.second is None),
+                    "be a material if --share, a map, is given, and only then",
+                )
+            },
+        )
         excluded = {"mesh", "count", "output", "material", "second"}
         options = {key: vars(self)[key] for key in vars(self).keys() - excluded}
         if self.second is not None:

@@ -99,6 +99,8 @@ class ViewOptions:
         """
         finite, positive = "be a finite number", "be 1 or more"
         azimuth, elevation, fill = self.single_light
+        if self.splats is not None:
+            check_unused(self, ["count"], f"the splats are those of {self.splats}")
         if self.environment is not None:
             check_unused(self, _SINGLE_LIGHT, "--environment replaces the single light")
         rules: Rules = {
@@ -153,10 +155,15 @@ class ViewOptions:
         name = self.environment_name
         if name in sj.io.ENVIRONMENTS:
             return sj.EnvironmentLight(sj.io.ENVIRONMENTS[name]())
-        if name and not Path(name).is_file():
-            raise ValueError(
-                f"{name}: there is no such file; built in are {', '.join(sj.io.ENVIRONMENTS)}"
-            )
+        check_options(
+            self,
+            {
+                "environment": (
+                    not name or Path(name).is_file(),
+                    f"be the path of a file, or one of {', '.join(sj.io.ENVIRONMENTS)}",
+                )
+            },
+        )
         return sj.io.load_environment(name) if name else None
 
     @property
@@ -200,20 +207,23 @@ class ViewOptions:
         return splats, self.material_for(splats)
 
     def material_for(self, splats: sj.Splats) -> sj.Material:
-        if self.diffusion == "shape" and splats.albedo is not None:
-            raise ValueError(
-                "--diffusion shape computes color from the coefficients of the material, and the "
-                "splats carry albedo; give --no-albedo"
-            )
+        check_options(
+            self,
+            {
+                "diffusion": (
+                    self.diffusion != "shape" or splats.albedo is None,
+                    "come with --no-albedo, because the material gives the color",
+                )
+            },
+        )
         material = sj.load_material(self.material)
         is_white = float(material.total_reflectance().min()) > _WHITE
         if splats.albedo is not None:
             material = material.white()
-            remedy = "" if is_white else "; --no-albedo gives the color of the material"
             if self.scattering:
                 note(
                     f"the color is the albedo of the splats, and {self.material} only spreads the "
-                    f"light{remedy}"
+                    f"light{'' if is_white else '; --no-albedo gives the color of the material'}"
                 )
         elif is_white:
             note(

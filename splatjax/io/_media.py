@@ -32,10 +32,9 @@ _OPENPBR: dict[str, Any] = {
     "specular_ior": 1.5,
     "subsurface_scatter_anisotropy": 0.0,
 }
-OPENPBR_ENTRIES = (
-    *("unit", *_OPENPBR),
-    *("subsurface_weight", "specular_weight", "specular_roughness"),
-)
+# Its entries for the surface, and the power that is the entry of [surface].
+_OF_SURFACE = (("specular_weight", "specular", 1), ("specular_roughness", "roughness", 2))
+OPENPBR_ENTRIES = ("unit", *_OPENPBR, "subsurface_weight", *(name for name, *_ in _OF_SURFACE))
 MEDIUM_ENTRIES = ("unit", "eta", *sorted(set().union(*_WAYS)))
 LAYER_ENTRIES = (*MEDIUM_ENTRIES, "optical_depth", "thickness", "thickness_unit")
 
@@ -72,15 +71,15 @@ def plain_openpbr(table: Table) -> tuple[dict[str, Any], dict[str, float]]:
         table.number("subsurface_weight", 1.0) == 1,
         "subsurface_weight must be 1; mixtures with an opaque surface are not supported",
     )
-    surface = {}
-    if "specular_weight" in table.entries:
-        surface["specular"] = table.number("specular_weight")
-    if "specular_roughness" in table.entries:
-        surface["roughness"] = table.number("specular_roughness") ** 2
     per_unit = _MM[table.one_of("unit", _MM)]
     color, radius, scale, eta, g = (table.numbers(*entry) for entry in _OPENPBR.items())
     medium = {"color": color, "mean_free_path": per_unit * radius * scale, "eta": eta, "g": g}
     plain = {name: values.tolist() for name, values in medium.items()}
+    surface = {
+        name: table.number(entry) ** power
+        for entry, name, power in _OF_SURFACE
+        if entry in table.entries
+    }
     return {"unit": THICKNESS_UNIT, **plain}, surface
 
 
@@ -113,5 +112,5 @@ def plain_layer(layer: Layer | Film) -> dict[str, Any]:
 def digest_of(tables: Mapping[str, Any]) -> str | None:
     """Compute a digest of the coefficients among the tables of a material; `None` without any."""
     optics = {kind: tables[kind] for kind in KINDS if kind in tables}
-    plain = json.dumps(optics, sort_keys=True).encode()
-    return hashlib.sha256(plain).hexdigest()[:16] if optics else None
+    plain = json.dumps(optics, sort_keys=True)
+    return hashlib.sha256(plain.encode()).hexdigest()[:16] if optics else None

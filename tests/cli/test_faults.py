@@ -64,7 +64,7 @@ REFUSED = {
     "render --material marbel": ["marbel"],
     "render plate.ply --camera missing.json": ["missing.json", "no such file"],
     "render plate.ply --camera picture.png:a": ["picture.png", "not a file of cameras"],
-    "render missing.toml": ["missing.toml", "scene"],
+    "render missing.toml": ["missing.toml", "no such file"],
     # Contents.
     "render scene.toml": ["scene.toml", "[splats] must be a table"],
     "studio scene.toml": ["scene.toml", "[splats] must be a table"],
@@ -93,7 +93,8 @@ REFUSED = {
     "render missing.ply --fov nan": ["--fov", "nan"],
     "render missing.ply --width 0": ["--width", "0"],
     "render missing.ply --height -3": ["--height", "-3"],
-    "render missing.ply --count 0": ["--count", "0"],
+    "render --count 0": ["--count", "0"],
+    "render plate.ply --count 9": ["--count is 9", "plate.ply"],
     "render missing.ply --scale 0": ["--scale", "0"],
     "render missing.ply --environment-rotation nan": ["--environment-rotation", "nan"],
     "render plate.ply --environment missing.hdr": ["missing.hdr"],
