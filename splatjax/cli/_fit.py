@@ -186,7 +186,10 @@ class Fit:
         _models.print_fit(fitted, target)
         if isinstance(coefficients, sj.Dipole):
             paths = format_numbers(1 / coefficients.medium.sigma_t_prime, ".3g")
-            note(f"{self.medium}: mean free path {paths} mm")
+            note(
+                f"{self.medium}: mean free path {paths} mm; the fit hardly weights the rows within "
+                "it, where tens of percent are usual"
+            )
         self._note_error(target, fitted)
         total = fitted.gaussians.total_reflectance()
         if float(total.max()) > 1 + 1e-3:

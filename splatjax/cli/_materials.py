@@ -34,6 +34,7 @@ _SCENES = {
     ".usda": sj.io.save_usd,
     ".usdc": sj.io.save_usd,
 }
+_OPEN = 0.02  # least mean normal of an open surface; that of a closed one is zero
 _ACROSS = 8  # pictures in a row of a sheet
 
 
@@ -257,9 +258,14 @@ class Sample:
             for name in ("albedo", "specular", "roughness", "weights")
             if getattr(splats, name) is not None
         ]
-        size = np.ptp(np.asarray(splats.centers), axis=0)
+        size, area = np.ptp(np.asarray(splats.centers), axis=0), float(splats.areas.sum())
+        if np.linalg.norm(splats.areas @ splats.normals) > _OPEN * area:
+            note(
+                f"{self.mesh}: its surface is open; near its rims too much light leaves, and as a "
+                "volume it cannot be exported; close the holes, or keep them out of the picture"
+            )
         note(
-            f"{splats.count} splats on {float(splats.areas.sum()):.4g} mm^2, with "
+            f"{splats.count} splats on {area:.4g} mm^2, with "
             f"{', '.join(carried) or 'no maps'}; the body is {size[0]:.3g} mm wide, {size[1]:.3g} "
             f"high and {size[2]:.3g} deep"
         )

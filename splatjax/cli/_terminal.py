@@ -94,13 +94,16 @@ def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
     if it changes. If stderr is not a terminal, it prints a line at most once a second.
     """
     begin = last = time.perf_counter()
+    first = begin, 0
     with CONSOLE.status(title) as status:
 
         def report(done: int, title: str = title) -> None:
-            nonlocal last
+            nonlocal first, last
             now = time.perf_counter()
-            remaining = (now - begin) / done * (total - done)
-            line = f"{title}: {done} of {total}, {remaining:.0f} s left"
+            first = first if first[1] else (now, done)  # before, programs are compiled
+            remaining = (now - first[0]) / max(done - first[1], 1) * (total - done)
+            is_known = done > first[1]
+            line = f"{title}: {done} of {total}{f', {remaining:.0f} s left' if is_known else ''}"
             status.update(line)
             if not CONSOLE.is_terminal and (done == total or now > last + 1):
                 last = now

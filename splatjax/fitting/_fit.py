@@ -151,18 +151,19 @@ class FitResult(eqx.Module):
     def table(self) -> list[tuple[str, str]]:
         """Return the Gaussians and their errors as rows of a name and one number per channel; the
         first row is the heading. With `VariancesPerChannel`, the Gaussians are listed channel by
-        channel.
+        channel. An energy error that rounds to 0 has no row.
         """
         weights = self.gaussians.weights.reshape(-1, self.gaussians.channels)
         names = ", ".join(channel_names(len(self.error)))
         pairs = zip(self.gaussians.variances.ravel(), weights, strict=True)
         total = jnp.sum(self.gaussians.weights, axis=-2).ravel()
+        lost = jnp.round(self.energy_error, 6) + 0.0
         return [
             ("variance, mm^2", f"weights ({names})"),
             *((f"{float(variance):.6g}", format_numbers(row, ".5f")) for variance, row in pairs),
             ("sum", format_numbers(total, ".5f")),
             ("error (Eq. 4)", format_numbers(self.error, ".2e")),
-            ("energy error", format_numbers(jnp.round(self.energy_error, 6) + 0.0, ".2e")),
+            *([("energy error", format_numbers(lost, ".2e"))] if bool(jnp.any(lost)) else []),
         ]
 
     def _repr_html_(self) -> str:

@@ -20,8 +20,8 @@ from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
 _SHORTEST, _LONGEST = 1e-9, 1e9  # mm; outside this range, single precision loses areas
 _COVER = (
-    "sample splats from it first: `splatjax sample {} --mm-per-unit ... --output ...`, or "
-    "sample_mesh"
+    "sample splats from it first: `splatjax sample {} --mm-per-unit ... --output ...`, in Python "
+    "sj.sample_mesh"
 )
 _COMPLETE = (
     "complete the file first: splatjax.write_splats(complete, splatjax.read_splats(path)) "
@@ -93,7 +93,13 @@ def read_splats(
     path = existing_file(path)
     check_units(path, mm_per_unit, up)
     kind = path.suffix[1:].lower()
-    require(kind == "ply" or kind not in FORMATS, path, f"is a mesh; {_COVER.format(path)}")
+    require(
+        kind in ("ply", "spz"),
+        path,
+        f"is a mesh; {_COVER.format(path)}"
+        if kind in FORMATS
+        else "is not a PLY or SPZ file; give one of splats (scenes: `splatjax render`)",
+    )
     with one_sentence(path):
         is_spz = kind == "spz"
         columns = {} if is_spz else load_with_trimesh(path, "ply")["columns"]

@@ -90,8 +90,11 @@ def test_sample_covers_a_mesh_that_may_have_z_up(tmp_path, capsys):
     cropped = sj.read_splats(output)
     assert np.median(np.abs(np.asarray(cropped.normals)).max(axis=1)) < 0.95
     assert float(jnp.min(cropped.centers[:, 1])) >= -1e-4
+    assert "box.stl: its surface is open" in capsys.readouterr().err
     assert run(*command, "--up", "z") == 0
-    assert "400 splats on 152 mm^2, with no maps" in capsys.readouterr().err
+    noted = capsys.readouterr().err
+    assert "400 splats on 152 mm^2, with no maps" in noted
+    assert "open" not in noted
     upright = sj.read_splats(output)
     np.testing.assert_allclose(np.abs(np.asarray(upright.normals)).max(axis=1), 1, atol=1e-6)
     assert np.ptp(np.asarray(upright.centers), axis=0).argmax() == 1

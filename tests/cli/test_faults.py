@@ -58,6 +58,8 @@ REFUSED = {
     "sample ball.obj --mm-per-unit 1 --share picture.png --output o.ply": ["--share", "--second"],
     "fit missing.toml": ["missing.toml"],
     "render ball.obj": ["ball.obj", "splatjax sample"],
+    "render picture.png": ["picture.png", "PLY or SPZ"],
+    "turntable scene.toml": ["scene.toml", "PLY or SPZ", "`splatjax render`"],
     "fit picture.png": ["picture.png", "TOML"],
     "fit marbel": ["marbel", "'marble'"],
     "materials marbel": ["marbel", "'marble'"],
@@ -260,6 +262,18 @@ def test_help_lists_every_command_and_the_version_is_printed(printed):
     assert re.findall(r"• (\w+) +[A-Z]", printed("--help")) == list(_COMMANDS)
     assert printed() == printed("--help")
     assert printed("--version") == f"splatjax {sj.__version__}, jax {jax.__version__}\n"
+
+
+def test_the_remaining_time_does_not_count_what_is_compiled_first(monkeypatch, capsys):
+    """The first of four steps takes 100 s, each other one 2 s."""
+    times = iter([0.0, 100.0, 102.0, 104.0, 106.0, 106.0])
+    monkeypatch.setattr(_terminal.time, "perf_counter", lambda: next(times))
+    with _terminal.stage("frames", 4) as report:
+        for done in range(1, 5):
+            report(done)
+    lines = capsys.readouterr().err.splitlines()
+    expected = ["1 of 4", "2 of 4, 4 s left", "3 of 4, 2 s left", "4 of 4, 0 s left"]
+    assert lines[:4] == [f"frames: {line}" for line in expected]
 
 
 COLORS = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "COLUMNS": "80", "LINES": "40"}

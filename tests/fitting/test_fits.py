@@ -111,8 +111,8 @@ def test_a_fit_reports_its_errors_and_held_energy_is_held_at_little_cost(float64
     rows = [[float(number) for number in row.split()] for _, row in free.table()[1:]]
     np.testing.assert_allclose(rows[:4], free.gaussians.weights, atol=SHOWN)
     np.testing.assert_allclose(rows[5], free.error, rtol=0.01)
-    counts = [fitted._repr_html_().count("<tr>") for fitted in (free, own)]
-    assert counts == [1 + 4 + 3, 1 + 3 * 4 + 3]
+    counts = [fitted._repr_html_().count("<tr>") for fitted in (free, own, held)]
+    assert counts == [1 + 4 + 3, 1 + 3 * 4 + 3, 1 + 4 + 2]  # the energy of `held` has no error
     # Each channel stands alone: green is fitted as if there were no other. The four Gaussians are
     # published.
     thrice = jax.tree.map(lambda leaf: jnp.full_like(leaf, leaf[1]), profile)
