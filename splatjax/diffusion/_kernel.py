@@ -183,7 +183,9 @@ class EscapeNormalization(AbstractDiffusionKernel):
     The curvature follows from `S_k`, the kernel's mass on the surface divided by its mass on a flat
     sheet: `H_k = (1 - 1 / S_k) / (depth sqrt(v_k))`, which is exact on spheres that are large
     against the layer. On a sheet much thinner than the layer is wide `S_k` is 2. A layer too wide
-    for its body uses the greatest mass of the narrower ones.
+    for its body uses the greatest mass of the narrower ones. Two limits keep the gain finite: a
+    `depth` below 0.25 counts as 0.25 in the curvature, and `kappa sqrt(v_k)` above 3 as 3 in the
+    growth, since Gaussians of such a width are not those of a physical medium.
 
     The gain is 1 on flat surfaces, where S < 1 (open edges, concave parts), and without absorption.
     For non-negative weights with a sum of at most one, no more light leaves than entered, `sum_k
