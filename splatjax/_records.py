@@ -144,10 +144,9 @@ def as_floats(values: Numbers, dtype: DTypeLike | None = None, name: str = "valu
     try:
         return jnp.asarray(values, dtype)
     except (TypeError, ValueError):
-        remedy = " (sj.scene.studio() makes an environment, sj.io.load_environment reads one)"
         raise ValueError(
             f"{name} must be numbers, in rows of equal length; got {values!r}"
-            f"{remedy if name == 'EnvironmentLight.image' else ''}"
+            f"{'; see sj.scene.studio() and sj.io.load_environment' if '.image' in name else ''}"
         ) from None
 
 

@@ -229,7 +229,7 @@ def test_traced_values_and_placeholders_pass_through_transformations():
             "3 points are too few",
         ),
         (lambda: check_displayable(31), "31 channels"),
-        (lambda: sj.EnvironmentLight("studio"), r"image .*'studio' .*sj\.scene\.studio\(\)"),
+        (lambda: sj.EnvironmentLight("studio"), r"image .*'studio'.*sj\.scene\.studio\(\)"),
         (
             lambda: sj.render(
                 sj.Scene(splats(), sj.DirectionalLight([0, 0, -1], [1, 1]), material()), camera()

@@ -5,7 +5,7 @@ renderers, and `splatjax sample` converts a mesh with maps to splats.
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -101,8 +101,9 @@ class Export:
               splatjax export scene.toml --output scene.glb
     """
 
-    #: Name of a material (`splatjax materials`), or path of a TOML file with a [fit]; for glTF and
-    #: USD the TOML file of a scene, or a picture of `splatjax render`.
+    #: Name of a material (`splatjax materials`), or path of a TOML file with a [fit], or for
+    #: MaterialX with coefficients; for glTF and USD the TOML file of a scene, or a picture of
+    #: `splatjax render`.
     source: tyro.conf.Positional[str]
     #: JSON, MTLX, GLB, USD, USDA or USDC file to write.
     output: Path
@@ -119,11 +120,16 @@ class Export:
                 check_unused(self, [name], f"{self.output} is no {only} file")
         save = _SCENES.get(suffix)
         if save is not None:
-            if not is_scene(Path(self.source)):
-                raise ValueError(
-                    f"{self.output} stores a scene, but {self.source} is a material; give the TOML "
-                    "file of a scene, or a picture of `splatjax render`"
-                )
+            check_options(
+                self,
+                {
+                    "output": (
+                        is_scene(Path(self.source)),
+                        f"be JSON or MTLX for a material, which {self.source} is; the others are "
+                        "for a scene or a picture of `splatjax render`",
+                    )
+                },
+            )
             with stage(f"loading {self.source}"):
                 scene, camera, _ = sj.io.load_scene(self.source)
                 mesh = sj.io.mesh_of_scene(sj.io.scene_table(self.source))
@@ -143,12 +149,23 @@ class Export:
             print(self.output)
             return
         with jax.enable_x64(True):
-            material = sj.load_material(self.source)
             if suffix == ".mtlx":
+                material = _with_coefficients(self.source)
                 sj.io.save_materialx(self.output, material, mm_per_unit=self.mm_per_unit)
             else:
-                sj.io.save_exports(material, self.output)
+                sj.io.save_exports(sj.load_material(self.source), self.output)
         print(self.output)
+
+
+def _with_coefficients(source: str) -> sj.Material:
+    """Load a material for OpenPBR, which needs no Gaussians if there are coefficients."""
+    try:
+        medium = sj.load_medium(source)
+    except ValueError:  # of Gaussians, layers or pigments
+        return sj.load_material(source)
+    surface: dict[str, Any] = {"eta": medium.eta[0]} | sj.io.surface_and_source(source)[0]
+    unused = sj.SumOfGaussians([1.0], medium.eta[None])
+    return sj.Material(unused, **surface, medium=medium)
 
 
 def _row(name: str) -> tuple[str, ...]:

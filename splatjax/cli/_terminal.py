@@ -102,8 +102,9 @@ def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
             now = time.perf_counter()
             first = first if first[1] else (now, done)  # before, programs are compiled
             remaining = (now - first[0]) / max(done - first[1], 1) * (total - done)
-            is_known = done > first[1]
-            line = f"{title}: {done} of {total}{f', {remaining:.0f} s left' if is_known else ''}"
+            line = f"{title}: {done} of {total}" + (
+                f", {remaining:.0f} s left" if done > first[1] else ""
+            )
             status.update(line)
             if not CONSOLE.is_terminal and (done == total or now > last + 1):
                 last = now

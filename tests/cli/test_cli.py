@@ -52,6 +52,16 @@ def test_export_writes_what_other_renderers_take(tmp_path, capsys):
     np.testing.assert_allclose(sj.io.read_record(output)["gaussians"]["variances"], variances)
 
 
+def test_export_of_coefficients_needs_no_fit(tmp_path):
+    """And gives the same as with it."""
+    text = sj.io.material_path("marble").read_text(encoding="utf-8")
+    for name, part in (("unfitted", text.partition("[fit]")[0]), ("fitted", text)):
+        (tmp_path / f"{name}.toml").write_text(part, encoding="utf-8")
+        output = tmp_path / f"{name}.mtlx"
+        assert run("export", tmp_path / f"{name}.toml", "--output", output) == 0
+    assert (tmp_path / "unfitted.mtlx").read_text() == (tmp_path / "fitted.mtlx").read_text()
+
+
 OF_MESH = {"mesh": "box.stl", "mm_per_unit": 10, "up": "z", "scale": 2, "count": 50}
 EXPORTED = """material = "skin"
 camera = { position = [0, 0, 620], target = [0, 0, 0], fov = 25 }
