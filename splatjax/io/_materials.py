@@ -100,8 +100,8 @@ def load_material(name_or_path: StrPath | Table) -> Material:
         if tables.name:  # it is a table of a scene
             remedy = "copy it to a file, `splatjax fit` that, and name the result as `material`"
         warnings.warn(
-            f"{tables.where.rstrip(':')} has coefficients that were changed after the fit, so its "
-            f"Gaussians are those of others; {remedy}",
+            f"{tables.where.rstrip(':')} has coefficients that were changed after the fit, and its "
+            f"Gaussians, which make the picture, are still of the earlier ones; {remedy}",
             stacklevel=1,  # a command that loads a file several times warns once
         )
     gaussians = fit.record(SumOfGaussians)
