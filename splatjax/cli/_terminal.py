@@ -94,13 +94,14 @@ def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
     if it changes. If stderr is not a terminal, it prints a line at most once a second.
     """
     begin = last = time.perf_counter()
-    first = begin, 0
+    first = begin, total
     with CONSOLE.status(title) as status:
 
         def report(done: int, title: str = title) -> None:
             nonlocal first, last
             now = time.perf_counter()
-            first = first if first[1] else (now, done)  # before, programs are compiled
+            # Before the first step of a task, programs are compiled.
+            first = first if done > first[1] else (now, done)
             remaining = (now - first[0]) / max(done - first[1], 1) * (total - done)
             line = f"{title}: {done} of {total}" + (
                 f", {remaining:.0f} s left" if done > first[1] else ""

@@ -265,15 +265,18 @@ def test_help_lists_every_command_and_the_version_is_printed(printed):
 
 
 def test_the_remaining_time_does_not_count_what_is_compiled_first(monkeypatch, capsys):
-    """The first of four steps takes 100 s, each other one 2 s."""
-    times = iter([0.0, 100.0, 102.0, 104.0, 106.0, 106.0])
+    """Of each of two tasks the first step takes 100 s, and each other one 2 s."""
+    times = iter([0.0, 100.0, 102.0, 104.0, 106.0, 206.0, 208.0, 208.0])
     monkeypatch.setattr(_terminal.time, "perf_counter", lambda: next(times))
     with _terminal.stage("frames", 4) as report:
         for done in range(1, 5):
             report(done)
+        report(1, "more")
+        report(2, "more")
     lines = capsys.readouterr().err.splitlines()
     expected = ["1 of 4", "2 of 4, 4 s left", "3 of 4, 2 s left", "4 of 4, 0 s left"]
     assert lines[:4] == [f"frames: {line}" for line in expected]
+    assert lines[4:6] == ["more: 1 of 4", "more: 2 of 4, 4 s left"]
 
 
 COLORS = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "COLUMNS": "80", "LINES": "40"}
