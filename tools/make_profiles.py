@@ -50,8 +50,7 @@ def main(names: list[str]) -> None:
         return
     for name in names or sj.io.list_materials():
         path = profiles_folder() / f"{name}.toml"
-        text = path.read_text(encoding="utf-8")
-        if any(table in text for table in ("[medium]", "[[layers]]", "[skin]")):
+        if {"[medium]", "[[layers]]", "[skin]"} & {*path.read_text(encoding="utf-8").splitlines()}:
             write(name, path)
 
 

@@ -138,8 +138,7 @@ def main() -> None:
     photons = int(sys.argv[1]) if len(sys.argv) > 1 else PHOTONS
     lines = [row(*TITLES), row(*["---"] * len(TITLES))]
     with jax.enable_x64(True):
-        for part in (half_spaces, slabs, layers):
-            lines.extend(part(photons))
+        lines += [line for part in (half_spaces, slabs, layers) for line in part(photons)]
     before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     table = "\n".join([BEGIN, *lines, END])
     PAGE.write_text(before + table + rest.split(END)[1], encoding="utf-8")

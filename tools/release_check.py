@@ -70,11 +70,11 @@ def main() -> None:
         installed = Path(file).is_relative_to(environment) and version == wheel.name.split("-")[1]
         check(installed, f"not what was installed: {file} {version}")
         run(splatjax, "--help", cwd=empty)
-        run(splatjax, "fit", "marble", "--output", "marble.toml", cwd=empty)
+        run(splatjax, "fit", "skin_light", "--output", "skin.toml", cwd=empty)
         readme = (ROOT / "README.md").read_text(encoding="utf-8")
         run(python, "-c", re.findall(r"```python\n(.*?)```", readme, re.DOTALL)[0], cwd=empty)
         made = sorted(path.name for path in empty.iterdir())
-        check(made == ["bust.exr", "bust.png", "marble.toml"], f"made {', '.join(made)}")
+        check(made == ["bust.exr", "bust.png", "skin.toml"], f"made {', '.join(made)}")
     print(f"{wheel.name} and {sdist.name} work")
 
 
