@@ -24,7 +24,7 @@ _OUTSIDE, _BEYOND = 12, 8  # numbers of cosines: refracted, and beyond the criti
 _MOMENTS = 12  # number of moments of the phase function
 _LEAST_COSINE = 1e-4
 _DEPTH = 0.05  # depth of the first layer of a half space, mean free paths
-_DOUBLINGS, _COVER_DOUBLINGS = 18, 8
+_DOUBLINGS, _COVER_DOUBLINGS = 22, 8
 
 
 @record
@@ -133,7 +133,7 @@ class HalfSpace(eqx.Module):
         - `eta`, `g`: as in the attributes.
 
         **Returns:** a half space whose `color()`, divided by that of a medium without absorption,
-        equals the given color within 1e-4 (in single precision, within 2e-2).
+        equals the given color within 1e-5.
 
         **Raises:** `ValueError` for a number out of its range.
         """
@@ -170,12 +170,14 @@ class HalfSpace(eqx.Module):
         return self._by_channel(_diffuse_albedo)
 
     def _by_channel(self, fraction: Callable[..., Array]) -> Float[Array, "channels *angles"]:
-        """Compute a fraction by reduced albedo, index, g, and the cover's albedo and depth."""
+        """Compute a fraction by `1 - albedo'`, index, g, and the cover's `1 - albedo'`, depth."""
         medium, cover = self.medium, self.cover
-        layer = cover and (cover.medium.albedo_prime, cover.medium.sigma_t_prime * cover.thickness)
-        # One channel at a time: with all at once, XLA never finishes compiling a program that also
-        # contains a fit.
-        inputs = medium.albedo_prime, medium.eta, self.g, layer
+        layer = cover and (
+            cover.medium.sigma_a / cover.medium.sigma_t_prime,
+            cover.medium.sigma_t_prime * cover.thickness,
+        )
+        # One channel at a time: with all at once, XLA never finishes compiling a fit as well.
+        inputs = medium.sigma_a / medium.sigma_t_prime, medium.eta, self.g, layer
         return jax.lax.map(lambda channel: fraction(*channel), inputs)
 
     @jit_unless_traced
@@ -208,22 +210,23 @@ def _similarity_of_color(
 
     def excess(similarity, constants):
         color, eta, g, white = constants
-        return _diffuse_albedo(1 - similarity * similarity, eta, g) / white - color
+        return _diffuse_albedo(similarity * similarity, eta, g) / white - color
 
-    # Without absorption, the color is 1 except for rounding.
-    constants = color, eta, g, _diffuse_albedo(jnp.ones_like(color), eta, g)
+    # Without absorption, the color is 1 except for rounding; just below, it has a root.
+    below = 1 - 16 * jnp.finfo(color.dtype).eps
+    constants = below * color, eta, g, _diffuse_albedo(jnp.zeros_like(color), eta, g)
     ends = {"lower": jnp.zeros_like(color), "upper": jnp.full_like(color, 1 - 1e-6)}
     solver, start = optx.Bisection(rtol=0, atol=0), 0.5 * ends["upper"]
     root = optx.root_find(excess, solver, start, constants, ends, max_steps=_HALVINGS, throw=False)
     return root.value
 
 
-def _directional_albedo(albedo_prime, eta, g, cover=None) -> Float[Array, " angles"]:
+def _directional_albedo(absorbed, eta, g, cover=None) -> Float[Array, " angles"]:
     """Compute the fraction of light, entering at each of `HalfSpace.cosines`, that leaves a half
-    space. The cover is given by its reduced albedo and reduced optical depth.
+    space, by `1 - albedo'`. The cover is given by its own and its reduced optical depth.
     """
     mu, weights, reflected = _directions(eta)
-    half_space = _doubled(mu, weights, albedo_prime, g)[1]
+    half_space = _doubled(mu, weights, absorbed, g)[1]
     identity = jnp.eye(len(mu), dtype=mu.dtype)
     if cover is not None:
         # Adding the cover.
@@ -239,11 +242,11 @@ def _directional_albedo(albedo_prime, eta, g, cover=None) -> Float[Array, " angl
     return leaving[: _OUTSIDE + 1, 0]
 
 
-def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
+def _doubled(mu, weights, absorbed, g, optical_depth=None):
     """Return the transmission and reflection, between all cosines, of a layer with a given reduced
     optical depth, or of a half space.
     """
-    even, odd, albedo, extinction = _redistribution(mu, weights, albedo_prime, g)
+    even, odd, albedo, lost, extinction = _redistribution(mu, weights, absorbed, g)
     doublings = _DOUBLINGS if optical_depth is None else _COVER_DOUBLINGS
     depth = _DEPTH if optical_depth is None else optical_depth * extinction / 2**doublings
 
@@ -253,7 +256,7 @@ def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
     losses = [half_depth * (identity - albedo * part) for part in (even, odd)]
     with_even, with_odd = (jnp.linalg.solve(identity + loss, identity - loss) for loss in losses)
     # Absorption of equal light from both sides, as a sum of positive terms.
-    absorbed = jnp.linalg.solve(identity + losses[0], 2 * half_depth * (1 - albedo))
+    absorbed = jnp.linalg.solve(identity + losses[0], 2 * half_depth * lost)
     layer = 0.5 * (with_even + with_odd), 0.5 * (with_even - with_odd), absorbed
 
     # Doubling; energy is conserved to rounding.
@@ -261,9 +264,7 @@ def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
         transmitted, reflected, absorbed = layer
         between = jnp.linalg.solve(
             identity - reflected @ reflected,
-            jnp.concatenate(
-                [transmitted, reflected @ transmitted, absorbed + reflected @ absorbed], axis=1
-            ),
+            jnp.hstack([transmitted, reflected @ transmitted, absorbed + reflected @ absorbed]),
         )
         count = len(identity)
         direct, back, below = jnp.split(between, [count, 2 * count], axis=1)
@@ -276,11 +277,11 @@ def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
     return transmitted, reflected
 
 
-def _diffuse_albedo(albedo_prime, eta, g, cover=None) -> Float[Array, ""]:
+def _diffuse_albedo(absorbed, eta, g, cover=None) -> Float[Array, ""]:
     """Compute the fraction of entered diffuse light that leaves again."""
     mu, weights, reflected = (values[: _OUTSIDE + 1] for values in _directions(eta))
     entering = mu * weights * (1 - reflected)
-    return jnp.vdot(entering, _directional_albedo(albedo_prime, eta, g, cover)) / jnp.sum(entering)
+    return jnp.vdot(entering, _directional_albedo(absorbed, eta, g, cover)) / jnp.sum(entering)
 
 
 def _directions(eta: Float[Array, ""]):
@@ -305,9 +306,9 @@ def _directions(eta: Float[Array, ""]):
     return mu, weights / jnp.sum(weights), reflected
 
 
-def _redistribution(mu, weights, albedo_prime, g):
+def _redistribution(mu, weights, absorbed, g):
     """Return the even and odd parts of the phase function between all cosines, times their weights;
-    and the albedo and the reduced extinction, with the forward peak counted as unscattered.
+    the albedo, what is absorbed instead, and the reduced extinction, with the peak unscattered.
     """
     polynomials = [jnp.ones_like(mu), mu]
     for n in range(1, _MOMENTS - 1):
@@ -315,16 +316,12 @@ def _redistribution(mu, weights, albedo_prime, g):
     legendre = jnp.stack(polynomials)
     peak = g**_MOMENTS
     powers = jnp.concatenate([jnp.ones(1, mu.dtype), jnp.broadcast_to(g, (_MOMENTS - 1,))])
-    moments = (
-        jnp.asarray(2 * np.arange(_MOMENTS) + 1, mu.dtype)
-        * (jnp.cumprod(powers) - peak)
-        / (1 - peak)
-    )
-    by_moment = legendre * moments[:, None]
+    moments = jnp.asarray(2 * np.arange(_MOMENTS) + 1, mu.dtype) * (jnp.cumprod(powers) - peak)
+    by_moment = legendre * moments[:, None] / (1 - peak)
     even, odd = (
         by_moment[parity::2].T @ (legendre[parity::2] * weights[None]) for parity in (0, 1)
     )
     even = even / jnp.sum(even, axis=1, keepdims=True)  # no energy is lost to rounding
-    scattered = albedo_prime * (1 - peak) / (1 - g)
-    extinction = scattered + 1 - albedo_prime
-    return even, odd, scattered / extinction, extinction
+    scattered = (1 - absorbed) * (1 - peak) / (1 - g)
+    extinction = scattered + absorbed
+    return even, odd, scattered / extinction, absorbed / extinction, extinction

@@ -315,7 +315,7 @@ def test_the_subsurface_of_openpbr_comes_in_with_its_defaults_and_its_color_goes
         HalfSpace(Medium(sigma_a, medium.sigma_s_prime, medium.eta), g * jnp.ones(3)).color()
         for sigma_a in (medium.sigma_a, 0 * medium.sigma_a)
     )
-    np.testing.assert_allclose(found / white, color, rtol=2e-2)  # of float32
+    np.testing.assert_allclose(found / white, color, rtol=1e-3)
 
 
 def test_an_exported_openpbr_surface_comes_back_with_its_highlight(tmp_path):
