@@ -291,9 +291,6 @@ def _number(cell: str) -> float | None:
         return None
 
 
-_OBSERVER = "CIE 1931 2 Degree Standard Observer"
-
-
 def spectrum_to_rgb(
     wavelengths: Numbers, illuminant: str = "D65"
 ) -> Float[np.ndarray, "wavelengths rgb"]:
@@ -307,23 +304,26 @@ def spectrum_to_rgb(
     **Arguments:**
 
     - `wavelengths`: nm, ascending.
-    - `illuminant`: name of the illuminant in colour-science (`colour.SDS_ILLUMINANTS`): "D65", "A",
-      "FL11", ...
+    - `illuminant`: name in colour-science of an illuminant (`colour.SDS_ILLUMINANTS`): "D65", "A",
+      "FL11", ..., or of a measured lamp (`colour.SDS_LIGHT_SOURCES`): "Philips TL-84", ...
 
     **Returns:** one row for each wavelength; the sum of each column is 1.
 
-    **Raises:** `ValueError` for wavelengths that do not ascend, and for an unknown name.
+    **Raises:** `ValueError` for wavelengths that do not ascend or cannot be seen, and for an
+    unknown name.
     """
     import colour  # takes two seconds
 
     nodes = np.asarray(wavelengths, np.float64)
     check_values("the steps of wavelengths", np.diff(nodes), "positive (nm)", lambda x: x > 0)
-    lights, observer = colour.SDS_ILLUMINANTS, colour.MSDS_CMFS[_OBSERVER]
+    if not nodes.size or nodes[0] > 780 or nodes[-1] < 380:
+        raise ValueError(f"wavelengths {nodes.tolist()} must be nm that the eye sees, 380 to 780")
+    lights = {**colour.SDS_ILLUMINANTS, **colour.SDS_LIGHT_SOURCES}
     if illuminant not in lights:
         raise ValueError(f"illuminant {illuminant!r} is unknown; {nearest(illuminant, lights)}")
     shape = colour.SpectralShape(380, 780, 1)
     light = lights[illuminant].copy().align(shape).values
-    seen = observer.copy().align(shape).values
+    seen = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape).values
     hats = [np.interp(shape.wavelengths, nodes, hat) for hat in np.eye(len(nodes))]
     xyz = np.asarray(hats) @ (light[:, None] * seen)
     rgb = xyz @ colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB.T

@@ -71,8 +71,13 @@ class AngularLaw(eqx.Module):
         total: Float[Array, " channels"],
         matrix: Float[Array, "channels colors"] | Float[np.ndarray, "channels colors"],
     ) -> "AngularLaw":
-        """Return the law for sums of channels, which are weighted by their total reflectance."""
-        return AngularLaw((self.coefficients * total[None]) @ matrix / (total @ matrix)[None])
+        """Return the law for sums of channels, which are weighted by their total reflectance. A sum
+        that cancels to a tenth or less has the law of all light.
+        """
+        shares = total[:, None] * matrix
+        is_left = jnp.sum(shares, axis=0) > 0.1 * jnp.sum(jnp.abs(shares), axis=0)
+        shares = jnp.where(is_left[None], shares, total[:, None])
+        return AngularLaw(self.coefficients @ shares / jnp.sum(shares, axis=0)[None])
 
     def __call__(self, mu: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         """Compute `e(mu)`; `mu` is the cosine outside, in [0, 1]."""
@@ -135,12 +140,17 @@ class HalfSpace(eqx.Module):
         **Returns:** a half space whose `color()`, divided by that of a medium without absorption,
         equals the given color within 1e-5.
 
-        **Raises:** `ValueError` for a number out of its range.
+        **Raises:** `ValueError` for a number out of its range, and for unequal numbers of channels.
         """
         arrays = [jnp.atleast_1d(as_floats(value)) for value in (color, mean_free_path, eta, g)]
+        sizes = [array.size for array in arrays]
+        if len({*sizes} - {1}) > 1:
+            raise ValueError(f"color, mean_free_path, eta, g: {sizes} numbers; give one or as many")
         color, mean_free_path, eta, g = jnp.broadcast_arrays(*arrays)
         check_values("color", color, "between 0.001 and 1", lambda x: (x >= 1e-3) & (x <= 1))
         check_values("mean_free_path", mean_free_path, "positive (mm)", lambda x: x > 0)
+        check_values("eta", eta, "at least 1", lambda x: x >= 1)
+        check_values("g", g, "between -0.95 and 0.95", lambda x: abs(x) <= 0.95)
         absorbed = jax.vmap(_similarity_of_color)(color, eta, g) ** 2  # 1 - albedo'
         # From the reduced albedo to that of the unreduced medium, without cancellation.
         per_mm = (1 - g) / (1 - g * absorbed) / mean_free_path
@@ -204,9 +214,7 @@ class HalfSpace(eqx.Module):
 def _similarity_of_color(
     color: Float[Array, ""], eta: Float[Array, ""], g: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Find the similarity parameter, the root of `1 - albedo'`, in which a color is almost
-    linear.
-    """
+    """Find the root of `1 - albedo'` (similarity parameter), in which a color is almost linear."""
 
     def excess(similarity, constants):
         color, eta, g, white = constants
@@ -233,7 +241,6 @@ def _directional_albedo(absorbed, eta, g, cover=None) -> Float[Array, " angles"]
         transmitted, back = _doubled(mu, weights, cover[0], g, cover[1])
         between = jnp.linalg.solve(identity - back @ half_space, transmitted)
         half_space = back + transmitted @ half_space @ between
-
     # Adding the surface: by reciprocity, the fraction of light from one direction that leaves
     # equals the fraction of light from all directions that leaves in that direction.
     leaving = jnp.linalg.solve(
@@ -297,13 +304,9 @@ def _directions(eta: Float[Array, ""]):
     is_denser = squared > 1
     critical = jnp.where(is_denser, jnp.sqrt(jnp.where(is_denser, squared - 1, 1.0)) / eta, 0.0)
     mu = jnp.concatenate([inside, jnp.maximum(critical * beyond, _LEAST_COSINE)])
-    weights = jnp.concatenate(
-        [outside_weights * outside / (squared * inside), critical * beyond_weights]
-    )
-    reflected = jnp.concatenate(
-        [reflectance(inside, outside, jnp.broadcast_to(eta, inside.shape)), jnp.ones_like(beyond)]
-    )
-    return mu, weights / jnp.sum(weights), reflected
+    weights = jnp.append(outside_weights * outside / (squared * inside), critical * beyond_weights)
+    reflected = reflectance(inside, outside, jnp.full_like(inside, eta))
+    return mu, weights / jnp.sum(weights), jnp.append(reflected, jnp.ones_like(beyond))
 
 
 def _redistribution(mu, weights, absorbed, g):

@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -23,12 +24,22 @@ class Projected(AbstractProfile):
 
     - `profile`: a profile of as many channels as the matrix has rows.
     - `matrix`: as `io.spectrum_to_rgb` computes it.
+
+    **Raises:** `ValueError` for a matrix of another number of rows.
     """
 
     profile: AbstractProfile
     matrix: Float[Array, "wavelengths colors"] = eqx.field(converter=numbers)
 
     singular: ClassVar[bool] = True
+
+    def __check_init__(self):
+        rows, channels = len(self.matrix), len(jax.eval_shape(self.profile.length_scale))
+        if rows != channels:
+            raise ValueError(
+                f"Projected.matrix has {rows} rows, and Projected.profile has {channels} channels; "
+                "give a row for each"
+            )
 
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return jnp.dot(self.profile(r), self.matrix)

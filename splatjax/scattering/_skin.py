@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import numbers, record, valid
+from splatjax._records import check_values, numbers, record, valid
 from splatjax._smooth import mean_decay
 from splatjax.gaussians import AbstractProfile
 
@@ -177,7 +177,8 @@ class Skin(eqx.Module):
     - `eta`: index of refraction; `g`: mean cosine of the phase function.
     - `wavelengths`: nm, of the channels; by default 400 to 700 in steps of 10.
 
-    **Raises:** `ValueError` for a value out of its range.
+    **Raises:** `ValueError` for a value out of its range, for more water and blood than the whole,
+    and without wavelengths.
 
     **Source:** two layers, melanins and baseline: Donner and Jensen 2006; scattering of skin, a
     mean over published measurements: Jacques 2013; eumelanin's share: Del Bino et al. 2015;
@@ -224,6 +225,12 @@ class Skin(eqx.Module):
         default=tuple(range(400, 701, 10)),
         metadata=valid("between 380 and 780 (nm)", lambda x: (x >= _SHORTEST) & (x <= _LONGEST)),
     )
+
+    def __check_init__(self):
+        together = self.water + self.blood
+        check_values("Skin.water and blood together", together, "at most 1", lambda x: x < 1 + 1e-6)
+        if np.shape(self.wavelengths) == (0,):
+            raise ValueError("Skin.wavelengths is empty; give one wavelength (nm) or more")
 
     @jit_unless_traced
     def media(self) -> tuple[Medium, Medium]:

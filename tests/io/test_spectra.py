@@ -25,7 +25,7 @@ SURFACE = (0.4 / 2.4) ** 2  # what an index of 1.4 reflects along the normal
 SIX = [0.02, 0.04, 0.07, 0.11, 0.17, 0.26]  # melanin from light to dark
 
 
-@pytest.mark.parametrize("illuminant", ["D65", "A", "FL11"])
+@pytest.mark.parametrize("illuminant", ["D65", "A", "FL11", "Philips TL-84"])
 def test_white_is_white_and_red_is_red(illuminant):
     matrix = sj.io.spectrum_to_rgb(WAVELENGTHS, illuminant)
     np.testing.assert_allclose(np.full(31, 0.3) @ matrix, 0.3, rtol=1e-12)
@@ -105,9 +105,11 @@ np.testing.assert_allclose(*fit(sj.scattering.Skin()), rtol=1e-4)
 def test_an_unknown_illuminant_is_named():
     assert_refused(
         lambda: sj.io.spectrum_to_rgb(WAVELENGTHS, "D66"),
-        "illuminant 'D66' is unknown; known are A, B",
+        "illuminant 'D66' is unknown; known are .* A, B",
     )
     assert_refused(lambda: sj.io.spectrum_to_rgb([500, 450]), "wavelengths must be positive")
+    for unseen in ([5000, 6000], []):
+        assert_refused(lambda unseen=unseen: sj.io.spectrum_to_rgb(unseen), "wavelengths .* 780")
 
 
 def test_a_skin_in_a_file_comes_back(tmp_path):

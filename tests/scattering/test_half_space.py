@@ -10,7 +10,14 @@ from bodies import PLAIN, assert_refused, sheet
 from jax.test_util import check_grads
 
 import splatjax as sj
-from splatjax.scattering import AngularLaw, HalfSpace, PhotonBeam, SingleScattering, Skin
+from splatjax.scattering import (
+    AngularLaw,
+    HalfSpace,
+    PhotonBeam,
+    Projected,
+    SingleScattering,
+    Skin,
+)
 
 COSINES = HalfSpace.cosines()
 
@@ -58,9 +65,9 @@ def test_colors_are_those_of_openpbr(float64, g):
 
 
 def test_the_coefficients_of_a_color_have_its_derivative(float64):
-    given = jnp.asarray([0.3, 0.6, 0.9]), jnp.asarray([1.0, 2.0, 3.0])
-    coefficients = jax.jit(lambda *given: HalfSpace.of_color(*given, 1.4, 0.3).medium)
-    check_grads(coefficients, given, order=1, modes=["rev"], eps=1e-3, rtol=1e-2)
+    given = jnp.asarray([[0.3, 0.6, 0.98], [1.0, 2.0, 3.0], [1.2, 1.4, 1.6], [0.3, -0.5, 0.8]])
+    coefficients = jax.jit(lambda given: HalfSpace.of_color(*given).medium)
+    check_grads(coefficients, (given,), order=1, modes=["rev"], eps=1e-3, rtol=1e-2)
 
 
 @pytest.mark.once
@@ -131,6 +138,15 @@ def test_light_leaves_whole_and_reciprocally(dtype):
     np.testing.assert_allclose(ratio, np.repeat(ratio[:, :1], 64, axis=1), rtol=1e-5)
 
 
+def test_a_color_that_almost_cancels_has_the_law_of_all_light():
+    """As blue of dark skin in lamplight: its own law would reach hundreds, or be negative."""
+    law, total = AngularLaw([[0.7, 1.3], [0.3, -0.3]]), jnp.asarray([0.2, 0.6])
+    colors = law.projected(total, jnp.asarray([[1.0, 1.0, 1.0], [0.5, -0.3333, -0.34]]))
+    shares = np.asarray([[0.2, 0.3], [0.2, 0.6], [0.2, 0.6]])
+    expected = np.asarray(law.coefficients) @ (shares.T / shares.sum(axis=1))
+    np.testing.assert_allclose(colors.coefficients, expected, rtol=1e-5)
+
+
 @pytest.mark.once
 def test_a_photon_beam_takes_the_total_of_transport():
     space, r = half_space([0.9, 0.99], 1.3), jnp.asarray([0.5, 2.0])
@@ -173,9 +189,15 @@ def test_a_flat_piece_sends_back_what_the_law_says():
         (lambda: half_space(0.9, 1.3, 0.99), "between -0.95 and 0.95"),
         (lambda: HalfSpace.of_color(1.2, 1.0), "color must be between"),
         (lambda: HalfSpace.of_color(0.5, 0.0), "mean_free_path"),
+        (lambda: HalfSpace.of_color(0.5, 1.0, 0.9), r"eta must be at least 1; .* 0\.9"),
+        (lambda: HalfSpace.of_color(0.5, 1.0, 1.3, 1.0), "g must be between -0.95 and 0.95"),
+        (lambda: HalfSpace.of_color([0.5] * 3, [1.0, 2.0]), r"mean_free_path.* \[3, 2, 1, 1\]"),
         (lambda: Skin(melanin=1.2), "Skin.melanin must be between"),
         (lambda: Skin(oxygenation=-0.1), "Skin.oxygenation must be between"),
         (lambda: Skin(wavelengths=[350, 500]), "Skin.wavelengths must be between"),
+        (lambda: Skin(wavelengths=[]), "Skin.wavelengths is empty"),
+        (lambda: Skin(water=0.9, blood=0.5), r"water and blood .* 1; got 1\.4"),
+        (lambda: Projected(PhotonBeam(half_space([0.5, 0.6]).medium), np.eye(3)), "3 rows.* 2 ch"),
         (
             lambda: sj.Material(sj.SumOfGaussians([1.0], [[0.5] * 3]), angles=AngularLaw([[1.0]])),
             "Material.angles has 1 channels",
