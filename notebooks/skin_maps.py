@@ -79,7 +79,7 @@ bust = sj.bust(2500).scaled(1 / 8).without_maps()
 camera = sj.Camera.look_at((9.0, 1.0, 72.0), (0.0, -2.2, 0.0), fov=27.0, width=72, height=72)
 window = sj.DirectionalLight((-0.9, -0.6, -0.8), np.full(3, 2.4), cast_shadows=False)
 fill = sj.DirectionalLight((1.0, 0.1, -0.9), np.full(3, 0.5), cast_shadows=False)
-material = sj.Material(base, eta=1.4, roughness=0.35)
+material = sj.Material(base, eta=1.5, roughness=0.35)
 rows = []
 for blood, oxygenation in ((0.006, 0.7), (0.02, 0.9)):
     rows.append([])
@@ -122,7 +122,7 @@ true = {
     "melanin": 0.025 * 4 ** spots(centers[rng.choice(front, 14, replace=False)], 0.8),
     "blood": 0.008 * 3 ** spots(cheeks, 1.8),
 }
-matte = sj.Material(base, eta=1.4, specular=0.0)
+matte = sj.Material(base, eta=1.5, specular=0.0)
 face = replace(figurine, weights=table.factors(true))
 observations = []
 for lamp in lamps:

@@ -20,8 +20,8 @@ LOCUS = {
     "a": ([4.8, 7.3, 7.9, 6.8, 4.5, 3.7], [7.8, 12.3, 13.9, 14.8, 12.9, 7.5]),
     "b": ([4.8, 7.6, 14.9, 14.5, 12.0, 10.0], [8.7, 17.3, 22.1, 22.5, 20.5, 15.8]),
 }
-NEAR = 3.5  # the darkest is 3.1 units of b* too yellow; the eye sees a difference of one or two
-SURFACE = (0.4 / 2.4) ** 2  # what an index of 1.4 reflects along the normal
+NEAR = 0.1  # the eye sees a difference of one or two
+SURFACE = (0.5 / 2.5) ** 2  # what an index of 1.5 reflects along the normal
 SIX = [0.02, 0.04, 0.07, 0.11, 0.17, 0.26]  # melanin from light to dark
 
 

@@ -220,16 +220,17 @@ MEASURED = {
     "dark": ([4.8, 5.1, 5.5, 6.3, 7.1, 9.9, 14.2], [11.0, 15.1, 16.5, 19.5, 25.9, 33.3, 40.2]),
 }
 SKINS = {
-    "light": {"melanin": 0.04, "blood": 0.015, "oxygenation": 0.6},
+    "light": {"melanin": 0.04, "blood": 0.015},
     "dark": {"melanin": 0.13, "blood": 0.01},
 }
-SURFACE = (0.4 / 2.4) ** 2  # what an index of 1.4 reflects along the normal
+SURFACE = (0.5 / 2.5) ** 2  # what an index of 1.5 reflects along the normal
 
 
 @pytest.mark.once
-@pytest.mark.parametrize("name", SKINS)
-def test_reflectance_lies_in_the_measured_range(name):
-    skin = Skin(**SKINS[name], wavelengths=MEASURED_AT)
+@pytest.mark.parametrize(("name", "melanin"), [("light", 0.03), ("dark", 0.1), ("dark", 0.22)])
+def test_reflectance_lies_in_the_measured_range(name, melanin):
+    """As the skins of the library have it."""
+    skin = Skin(melanin, wavelengths=MEASURED_AT)
     reflected = SURFACE + (1 - SURFACE) * skin.half_space().total_reflectance()
     low, high = MEASURED[name]
     np.testing.assert_array_less(low, 100 * reflected)
