@@ -50,10 +50,11 @@ def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
     return 4 * jnp.pi * diffuse_scaling(gaussians.total_reflectance()) * burley_distance(gaussians)
 
 
-def mean_free_path(material: Material) -> Float[Array, " channels"]:
-    r"""Compute the reduced mean free path of a material.
+def mean_free_path(material: Material, g: float = 0.0) -> Float[Array, " channels"]:
+    r"""Compute the mean free path of a material, `1 / (sigma_a + sigma_s' / (1 - g))`.
 
-    It is that of the material's coefficients if there are any. Otherwise it is `s(A) d`, with the
+    It is that of the material's coefficients if there are any, reduced for a mean cosine `g` of 0.
+    Otherwise it is `s(A) d`, with the
     total reflectance A and the `d` of `burley_distance`, by which normalized diffusion is as wide
     as the Gaussians.
 
@@ -62,12 +63,12 @@ def mean_free_path(material: Material) -> Float[Array, " channels"]:
     **Source:** the curve `s` for diffuse transmission: Christensen and Burley 2015, Eq. 6.
     """
     if material.medium is not None:
-        return 1 / material.medium.sigma_t_prime
+        return 1 / (material.medium.sigma_a + material.medium.sigma_s_prime / (1 - g))
     return blender_radius(material.gaussians) / (4 * jnp.pi)
 
 
 def openpbr_subsurface(
-    material: Material,
+    material: Material, g: float = 0.0
 ) -> dict[str, Float[Array, ""] | Float[Array, " channels"]]:
     r"""Compute the subsurface parameters of OpenPBR.
 
@@ -78,24 +79,24 @@ def openpbr_subsurface(
     **Arguments:**
 
     - `material`: Differentiable.
+    - `g`: mean cosine of the phase function of its coefficients (`io.load_mean_cosine`).
 
     **Returns:** `subsurface_color`, `subsurface_radius` (the largest mean free path, mm),
-    `subsurface_radius_scale`, and `subsurface_scatter_anisotropy`, 0 since the coefficients are
-    reduced.
+    `subsurface_radius_scale`, and `subsurface_scatter_anisotropy`, which is `g`.
 
     **Source:** Andersson et al. 2024, OpenPBR surface 1.1, "Subsurface".
     """
     color, medium = material.total_reflectance(), material.medium
     if medium is not None:
         white = Medium(jnp.zeros_like(medium.sigma_a), medium.sigma_s_prime, medium.eta)
-        color = HalfSpace(medium).color() / HalfSpace(white).color()
-    lengths = mean_free_path(material)
+        color = HalfSpace(medium, g).color() / HalfSpace(white, g).color()
+    lengths = mean_free_path(material, g)
     radius = jnp.max(lengths)
     return {
         "subsurface_color": color,
         "subsurface_radius": radius,
         "subsurface_radius_scale": lengths / radius,
-        "subsurface_scatter_anisotropy": jnp.zeros_like(radius),
+        "subsurface_scatter_anisotropy": jnp.full_like(radius, g),
     }
 
 

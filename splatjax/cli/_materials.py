@@ -132,26 +132,23 @@ class Export:
             )
             with stage(f"loading {self.source}"):
                 scene, camera, _ = sj.io.load_scene(self.source)
-                mesh = sj.io.mesh_of_scene(sj.io.scene_table(self.source))
+                table = sj.io.scene_table(self.source)
+                mesh = sj.io.mesh_of_scene(table)
+                g = sj.io.load_mean_cosine(sj.io.material_of_scene(table))
             if mesh is None:
                 note(
                     f"the body is a hexagon for each of its {scene.splats.count} splats, which are "
                     "not closed, so that light cannot scatter below its surface in other "
                     "renderers; give a scene whose [splats] has `mesh` in place of `file`"
                 )
-            save(
-                self.output,
-                scene,
-                camera,
-                mesh=mesh,
-                **({"lux": self.lux} if suffix == ".glb" else {}),
-            )
+            own = {"lux": self.lux} if suffix == ".glb" else {"g": g}
+            save(self.output, scene, camera, mesh=mesh, **own)
             print(self.output)
             return
         with jax.enable_x64(True):
             if suffix == ".mtlx":
-                material = _with_coefficients(self.source)
-                sj.io.save_materialx(self.output, material, mm_per_unit=self.mm_per_unit)
+                material, g = _with_coefficients(self.source), sj.io.load_mean_cosine(self.source)
+                sj.io.save_materialx(self.output, material, mm_per_unit=self.mm_per_unit, g=g)
             else:
                 sj.io.save_exports(sj.load_material(self.source), self.output)
         print(self.output)

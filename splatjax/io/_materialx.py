@@ -23,7 +23,9 @@ _DOCUMENT = Template("""<?xml version='1.0' encoding='utf-8'?>
 """)
 
 
-def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.0) -> None:
+def save_materialx(
+    path: StrPath, material: Material, *, mm_per_unit: float = 1.0, g: float = 0.0
+) -> None:
     r"""Write a material as a MaterialX document with an OpenPBR surface, completely or not at all.
 
     The color and the mean free path of the subsurface follow from the material's coefficients, or
@@ -34,12 +36,13 @@ def save_materialx(path: StrPath, material: Material, *, mm_per_unit: float = 1.
 
     - `material`: a material of one or three channels.
     - `mm_per_unit`: length of the unit of the other renderer's scene, mm.
+    - `g`: mean cosine of the phase function of the coefficients (`load_mean_cosine`).
 
     **Raises:** `ValueError` for a material of another number of channels; `OSError` if the file
     cannot be written.
     """
     check_units(path, mm_per_unit)
-    inputs = openpbr_inputs(path, material, mm_per_unit)
+    inputs = openpbr_inputs(path, material, mm_per_unit, g)
     lines = []
     for name, values in inputs.items():
         kind = "float" if len(values) == 1 else "color3"
@@ -56,13 +59,15 @@ def check_colors(path: StrPath, material: Material) -> None:
     require(material.channels in (1, 3), path, fault)
 
 
-def openpbr_inputs(path: StrPath, material: Material, mm_per_unit: float) -> dict[str, list[float]]:
+def openpbr_inputs(
+    path: StrPath, material: Material, mm_per_unit: float, g: float
+) -> dict[str, list[float]]:
     """Return the inputs of an OpenPBR surface in a file, one or three numbers each.
 
     **Raises:** `ValueError` for a material of another number of channels.
     """
     check_colors(path, material)
-    inputs = openpbr_subsurface(material)
+    inputs = openpbr_subsurface(material, g)
     inputs["subsurface_radius"] /= mm_per_unit
     inputs |= {
         "subsurface_weight": jnp.ones(()),

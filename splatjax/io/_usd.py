@@ -105,7 +105,9 @@ _LIGHT = Template("""
 """)
 
 
-def save_usd(path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None = None) -> None:
+def save_usd(
+    path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None = None, g: float = 0.0
+) -> None:
     r"""Write a scene as USD: triangles, an OpenPBR material, camera and lights, in meters.
 
     The color of the subsurface is the albedo of the splats, stored as vertex colors, if there is
@@ -115,6 +117,7 @@ def save_usd(path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None =
     **Arguments:**
 
     - `mesh`: closed triangles that bound the body, mm; `None` draws a hexagon for each splat.
+    - `g`: mean cosine of the phase function of the material's coefficients (`load_mean_cosine`).
 
     A warning names lights that USD cannot store.
 
@@ -128,7 +131,7 @@ def save_usd(path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None =
 
     body = body_mesh(scene.splats, mesh)
     has_albedo = body.colors is not None
-    openpbr, preview = _surfaces(openpbr_inputs(path, scene.material, 1 / METERS), has_albedo)
+    openpbr, preview = _surfaces(openpbr_inputs(path, scene.material, 1 / METERS, g), has_albedo)
     text = _SCENE.substitute(
         openpbr=openpbr,
         preview=preview,

@@ -50,6 +50,11 @@ def test_export_writes_what_other_renderers_take(tmp_path, capsys):
     assert capsys.readouterr().out == f"{output}\n"
     variances = [0.0064, 0.0484, 0.187, 0.567, 1.99, 7.41]
     np.testing.assert_allclose(sj.io.read_record(output)["gaussians"]["variances"], variances)
+    mine, output = tmp_path / "mine.toml", tmp_path / "mine.mtlx"
+    marble = sj.io.material_path("marble").read_text(encoding="utf-8")
+    mine.write_text(marble.replace("[medium]", "[medium]\ng = 0.5"), encoding="utf-8")
+    assert run("export", mine, "--output", output) == 0
+    assert 'anisotropy" type="float" value="0.5"' in output.read_text(encoding="utf-8")
 
 
 def test_export_of_coefficients_needs_no_fit(tmp_path):

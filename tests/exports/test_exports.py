@@ -7,6 +7,7 @@ import json
 import jax.numpy as jnp
 import MaterialX
 import numpy as np
+import pytest
 from bodies import assert_close, assert_refused
 
 import splatjax as sj
@@ -111,17 +112,21 @@ def read(path) -> dict[str, np.ndarray]:
     return values
 
 
-def test_the_coefficients_come_back(tmp_path, float64):
+@pytest.mark.parametrize("g", [0.0, 0.9, -0.5])
+def test_the_coefficients_come_back(tmp_path, float64, g):
     """Absorbing, nearly white, and in between; lengths in another unit."""
     medium = Medium([2.0, 0.01, 1e-4], [0.5, 1.0, 2.0], 1.4)
     material = sj.Material(sj.SumOfGaussians([1.0], [[0.5] * 3]), 1.4, 0.5, 0.25, medium=medium)
-    save_materialx(tmp_path / "it.mtlx", material, mm_per_unit=10.0)
+    save_materialx(tmp_path / "it.mtlx", material, mm_per_unit=10.0, g=g)
     found = read(tmp_path / "it.mtlx")
     path = 10 * found["subsurface_radius"] * found["subsurface_radius_scale"]
     given = found["subsurface_color"], path, found["specular_ior"]
     back = HalfSpace.of_color(*given, g=found["subsurface_scatter_anisotropy"]).medium
     expected = medium.sigma_a, medium.sigma_s_prime
     assert_close((back.sigma_a, back.sigma_s_prime), expected, rtol=BACK)
+    np.testing.assert_allclose(found["subsurface_scatter_anisotropy"], g, rtol=1e-6)
+    colors = HalfSpace(back, g).color(), HalfSpace(medium, g).color()
+    np.testing.assert_allclose(*colors, rtol=1e-3)
     surface = found["specular_weight"], found["specular_roughness"]
     np.testing.assert_allclose(surface, 0.5, rtol=1e-6)
 

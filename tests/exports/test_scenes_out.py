@@ -107,16 +107,17 @@ def test_the_coefficients_return_from_gltf(tmp_path, float64):
     assert material.pbrMetallicRoughness.roughnessFactor == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("medium", [MEDIUM, None])
-def test_usd_has_the_surface_of_materialx(tmp_path, float64, medium):
+@pytest.mark.parametrize(("medium", "g"), [(MEDIUM, 0.8), (None, 0.0)])
+def test_usd_has_the_surface_of_materialx(tmp_path, float64, medium, g):
     """In meters, and with the color of the splats where they have one."""
     scene = a_scene(medium=medium)
-    stage = usd(tmp_path / "it.usda", scene, CAMERA)
+    stage = usd(tmp_path / "it.usda", scene, CAMERA, g=g)
     found = values(stage, "/scene/material/ND_open_pbr_surface_surfaceshader")
     path = 1000 * found["subsurface_radius"] * found["subsurface_radius_scale"]
-    color = sj.exports.openpbr_subsurface(scene.material)["subsurface_color"]
-    expected = sj.exports.mean_free_path(scene.material), color, 1.4
+    color = sj.exports.openpbr_subsurface(scene.material, g)["subsurface_color"]
+    expected = sj.exports.mean_free_path(scene.material, g), color, 1.4
     assert_close((path, found["subsurface_color"], found["specular_ior"]), expected, rtol=1e-6)
+    assert found.get("subsurface_scatter_anisotropy", 0.0) == pytest.approx(g)
     stage = usd(tmp_path / "of_splats.usda", a_scene(has_albedo=True), CAMERA)
     body = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/scene/body"))
     material, _ = body.ComputeBoundMaterial()
