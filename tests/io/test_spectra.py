@@ -67,6 +67,26 @@ def test_six_skins_descend_along_the_locus():
         np.testing.assert_allclose(found, np.clip(found, low, high), rtol=0, atol=NEAR)
 
 
+@pytest.mark.once
+@pytest.mark.parametrize(
+    ("melanin", "lamp", "error"), [(0.02, "A", 1.7), (0.1, "LED-B1", 6.6), (0.26, "FL11", 4.4)]
+)
+def test_weights_for_daylight_are_off_under_a_lamp(melanin, lamp, error):
+    """By the Delta E of docs/howto/fit.md, to an eye adapted to the lamp."""
+    import colour
+
+    to_rgb = colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB
+    tables = colour.SDS_ILLUMINANTS[lamp], colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    shape = colour.SpectralShape(380, 780, 1)
+    light, observer = (each.copy().align(shape).values for each in tables)
+    white = light @ observer
+    spectrum = np.asarray(sj.scattering.Skin(melanin).half_space().total_reflectance())
+    rgb = (spectrum @ sj.io.spectrum_to_rgb(WAVELENGTHS, name) for name in ("D65", lamp))
+    xyz = (np.linalg.solve(to_rgb, each * (to_rgb @ white / white[1])) for each in rgb)
+    lab = (colour.XYZ_to_Lab(each, colour.XYZ_to_xy(white)) for each in xyz)
+    np.testing.assert_allclose(colour.delta_E(*lab, method="CIE 2000"), error, atol=0.1)
+
+
 def test_a_projected_picture_is_the_picture_of_projected_weights():
     """Where the kernel has gain 1."""
     body, matrix = sphere(200), sj.io.spectrum_to_rgb(WAVELENGTHS)
