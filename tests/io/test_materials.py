@@ -52,7 +52,7 @@ GOOD_MEDIUM = '[medium]\nunit = "1/mm"\nsigma_a = [0.1]\nsigma_s_prime = [1.0]\n
 GOOD_FIT = '[fit]\nunit = "mm^2"\nvariances = [0.1, 2.0]\nweights = [[0.2], [0.3]]\n'
 
 
-def test_jensens_and_narasimhans_media_skin_and_five_made_up_are_shipped():
+def test_jensens_and_narasimhans_media_skin_and_seven_made_up_are_shipped():
     jensen = (
         "apple chicken1 chicken2 cream ketchup marble potato skimmilk skin1 skin2 "
         "spectralon wholemilk"
@@ -60,7 +60,7 @@ def test_jensens_and_narasimhans_media_skin_and_five_made_up_are_shipped():
     narasimhan = """cappuccino_powder espresso lemon_tea_powder lowfat_chocolate_milk lowfat_milk
         lowfat_soy_milk reduced_milk
         regular_chocolate_milk regular_milk regular_soy_milk shampoo white_grapefruit_juice"""
-    made_up = ["ivory", "jade", "porcelain", "soap", "wax"]
+    made_up = ["grape", "ivory", "jade", "leaf", "porcelain", "soap", "wax"]
     others = ["marble_gems", "skin", "skin_layers", *PIGMENTED, *made_up]
     assert list_materials() == tuple(sorted([*jensen.split(), *narasimhan.split(), *others]))
 
