@@ -297,9 +297,10 @@ class Fit:
             top = (
                 coefficients.top if isinstance(coefficients, sj.LayeredMultipole) else coefficients
             )
-            eta = top.eta if isinstance(top, sj.scattering.Skin) else top.medium.eta[0]
             surface, source = sj.io.surface_and_source(self.medium)
-            surface.setdefault("eta", eta)
+            if not isinstance(top, sj.scattering.Burley):
+                eta = top.eta if isinstance(top, sj.scattering.Skin) else top.medium.eta[0]
+                surface.setdefault("eta", eta)
         fitted_by = (
             f"fitted by splatjax {sj.__version__} to the "
             f"{'profile' if coefficients is None else 'coefficients'} of {self.medium}"

@@ -17,7 +17,9 @@ import splatjax as sj
 from ._terminal import print_table, stage
 
 Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carlo"]
-Coefficients: TypeAlias = sj.Dipole | sj.LayeredMultipole | sj.scattering.Skin
+Coefficients: TypeAlias = (
+    sj.Dipole | sj.LayeredMultipole | sj.scattering.Skin | sj.scattering.Burley
+)
 # Weights of the fit to a medium: the picture keeps its energy.
 MEDIUM_WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 
@@ -73,12 +75,15 @@ def reference(
     **Raises:** `ValueError` for options that the model, or a material with layers, does not
     support.
     """
-    if isinstance(coefficients, sj.scattering.Skin):
+    is_burley = isinstance(coefficients, sj.scattering.Burley)
+    if is_burley or isinstance(coefficients, sj.scattering.Skin):
         if model or g or single_scattering:
             raise ValueError(
-                "a [skin] is fitted by light transport in its layers, with the g of its table; "
-                "leave --model, --g and --single-scattering out"
+                "a [skin] is fitted by light transport in its layers, with the g of its table, and "
+                "a [burley] as it is; leave --model, --g and --single-scattering out"
             )
+        if is_burley:
+            return Reference(coefficients, sj.fitting.TransportModel.rule)
         # In linear sRGB, under daylight.
         skin = sj.fitting.SkinModel(sj.io.spectrum_to_rgb(coefficients.wavelengths))
         return _by_model(skin, coefficients)

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +17,7 @@ from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
     AngularLaw,
     BetterDipole,
+    Burley,
     Dipole,
     ExactFresnel,
     LayeredMultipole,
@@ -29,13 +30,16 @@ from splatjax.scene import Material
 
 from ._files import StrPath, naming, plain_record, record_names, require
 from ._media import (
+    BURLEY_ENTRIES,
     KINDS,
     LAYER_ENTRIES,
     MEDIUM_ENTRIES,
     OPENPBR_ENTRIES,
+    burley_of,
     digest_of,
     layer_of,
     medium_of,
+    plain_burley,
     plain_layer,
     plain_medium,
     plain_openpbr,
@@ -45,12 +49,15 @@ from ._tables import Table, nearest, read_toml, write_toml
 VARIANCE_UNIT = "mm^2"
 MATERIAL_TABLES = (*KINDS, "surface", "single_scattering", "angles", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
+_Stored: TypeAlias = Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin | Burley
 # Names in [fit] of profiles whose coefficients are in the file.
 _MODELS: dict[type, str] = {
     Dipole: "classical dipole",
     BetterDipole: "better dipole",
     PhotonBeam: "photon beam with single scattering",
     LayeredMultipole: "multipole",
+    Skin: "photon beams of dermis and epidermis with the total of light transport",
+    Burley: "normalized diffusion",
 }
 
 
@@ -145,7 +152,9 @@ def load_medium(name_or_path: StrPath) -> Medium:
     tables, _, profile = _read(name_or_path)
     if isinstance(profile, Dipole):
         return profile.medium
-    contents = "layers or pigments (`load_profile`)" if profile else "Gaussians (`load_material`)"
+    contents = (
+        "layers, pigments or profile (`load_profile`)" if profile else "Gaussians (`load_material`)"
+    )
     raise ValueError(
         f"{tables.path}: has no [medium], only its {contents}; give a material with coefficients"
     )
@@ -162,14 +171,14 @@ def load_mean_cosine(material: StrPath | Table) -> float:
     return tables.table("medium", MEDIUM_ENTRIES).number("g", 0.0)
 
 
-def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin:
+def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin | Burley:
     r"""Load the coefficients of a material as a profile to which Gaussians can be fitted, or its
     pigments.
 
     **Arguments:** `name_or_path`: one of `list_materials()`, or the path of a TOML file.
 
-    **Returns:** the `Dipole` of a [medium] or [openpbr], the `LayeredMultipole` of [[layers]], or
-    the `Skin` of a [skin], in JAX's default precision.
+    **Returns:** the `Dipole` of a [medium] or [openpbr], the `LayeredMultipole` of [[layers]], the
+    `Skin` of a [skin], or the `Burley` of a [burley], in JAX's default precision.
 
     **Raises:** `ValueError` as `load_medium` does.
     """
@@ -222,14 +231,16 @@ def plain_material(
     g: float = 0.0,
 ) -> dict[str, Any]:
     """Return the tables of a material's file; arguments are those of `save_material`."""
-    if not isinstance(profile, Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin | None):
+    if not isinstance(profile, _Stored | None):
         raise ValueError(
-            "profile must be a Dipole, BetterDipole, PhotonBeam, LayeredMultipole or Skin, "
+            "profile must be a Dipole, BetterDipole, PhotonBeam, LayeredMultipole, Skin or Burley, "
             f"which a file can store; got {type(profile).__name__}"
         )
     tables: dict[str, Any] = {}
     if isinstance(profile, Skin):
         tables["skin"] = plain_record(profile)
+    elif isinstance(profile, Burley):
+        tables["burley"] = plain_burley(profile)
     elif isinstance(profile, LayeredMultipole):
         tables["layers"] = [plain_layer(layer) for layer in profile.layers]
     elif (medium := material.medium if profile is None else profile.medium) is not None:
@@ -274,7 +285,7 @@ def _tables(name_or_path: StrPath) -> Table:
 
 def _read(
     material: StrPath | Table,
-) -> tuple[Table, dict[str, Array], Dipole | LayeredMultipole | Skin | None]:
+) -> tuple[Table, dict[str, Array], Dipole | LayeredMultipole | Skin | Burley | None]:
     """Read the tables of a material, its surface, and its coefficients, if any."""
     tables = material if isinstance(material, Table) else _tables(material)
     path, entries, profile = tables.path, tables.entries, None
@@ -297,6 +308,8 @@ def _read(
         profile = Dipole(medium_of(tables.table("medium", MEDIUM_ENTRIES)))
     elif "skin" in entries:
         profile = tables.table("skin", record_names(Skin)).record(Skin)
+    elif "burley" in entries:
+        profile = burley_of(tables.table("burley", BURLEY_ENTRIES))
     elif "layers" in entries:
         layers = [layer_of(layer) for layer in tables.tables("layers", LAYER_ENTRIES)]
         with naming(f"{path}: [[layers]]"):
@@ -304,9 +317,9 @@ def _read(
     return tables, surface, profile
 
 
-def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin) -> str:
-    if isinstance(profile, Skin):
-        return "photon beams of dermis and epidermis with the total of light transport"
+def _description(profile: _Stored) -> str:
+    if isinstance(profile, Skin | Burley):
+        return _MODELS[type(profile)]
     layers = f" of {len(profile.layers)} layers" if isinstance(profile, LayeredMultipole) else ""
     moments = "exact" if isinstance(profile.fresnel, ExactFresnel) else "fitted"
     return f"{_MODELS[type(profile)]}{layers}, {moments} Fresnel moments"

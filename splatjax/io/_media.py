@@ -1,21 +1,33 @@
-"""The tables [medium], [[layers]] and [skin] of materials: optical coefficients, a color and a mean
-free path, or pigments.
+"""The tables [medium], [openpbr], [burley] and [[layers]] of materials: optical coefficients, or a
+color and a length.
 """
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from splatjax._records import check_values
-from splatjax.scattering import Film, HalfSpace, Layer, Medium
+from splatjax.exports import plain_numbers
+from splatjax.scattering import (
+    Burley,
+    Film,
+    HalfSpace,
+    Layer,
+    Medium,
+    diffuse_mean_free_path_scaling,
+    diffuse_scaling,
+    searchlight_scaling,
+)
 
 from ._files import plain_record
 from ._tables import Table
 
-KINDS = {"medium": "[medium]", "openpbr": "[openpbr]", "layers": "[[layers]]", "skin": "[skin]"}
+KINDS = {k: f"[{k}]" for k in ("medium", "openpbr", "burley", "skin")} | {"layers": "[[layers]]"}
 COEFFICIENT_UNIT, THICKNESS_UNIT = "1/mm", "mm"
 _PER_MM = {COEFFICIENT_UNIT: 1.0, "1/cm": 0.1}
 _WAYS = (
@@ -35,6 +47,15 @@ _OPENPBR: dict[str, Any] = {
 # Its entries for the surface, and the power that is the entry of [surface].
 _OF_SURFACE = (("specular_weight", "specular", 1), ("specular_roughness", "roughness", 2))
 OPENPBR_ENTRIES = ("unit", *_OPENPBR, "subsurface_weight", *(name for name, *_ in _OF_SURFACE))
+# Lengths of normalized diffusion, over its `d`: of Unity's HDRP; Unreal; Christensen and Burley
+# 2015; Blender (`exports.blender_radius`).
+_BURLEY: dict[str, Callable[[Array], Array]] = {
+    "scattering_distance": jnp.ones_like,
+    "diffuse_mean_free_path": diffuse_mean_free_path_scaling,
+    "mean_free_path": searchlight_scaling,
+    "radius": lambda albedo: 4 * jnp.pi * diffuse_scaling(albedo),
+}
+BURLEY_ENTRIES = "unit", "albedo", *_BURLEY
 MEDIUM_ENTRIES = ("unit", "eta", *sorted(set().union(*_WAYS)))
 LAYER_ENTRIES = (*MEDIUM_ENTRIES, "optical_depth", "thickness", "thickness_unit")
 
@@ -81,6 +102,23 @@ def plain_openpbr(table: Table) -> tuple[dict[str, Any], dict[str, float]]:
         if entry in table.entries
     }
     return {"unit": THICKNESS_UNIT, **plain}, surface
+
+
+def burley_of(table: Table) -> Burley:
+    """Make normalized diffusion from a table of its albedo and one of its lengths."""
+    names = [name for name in _BURLEY if name in table.entries]
+    fault = f"has {' and '.join(names) or 'no length'}; give one of {', '.join(_BURLEY)}"
+    table.require(len(names) == 1, fault)
+    length = _MM[table.one_of("unit", _MM)] * table.numbers(names[0])
+    return table.make(Burley, table.numbers("albedo"), length, _BURLEY[names[0]])
+
+
+def plain_burley(profile: Burley) -> dict[str, Any]:
+    return {
+        "unit": THICKNESS_UNIT,
+        "albedo": plain_numbers(profile.albedo),
+        "scattering_distance": plain_numbers(profile.length_scale()),
+    }
 
 
 def layer_of(table: Table) -> Layer | Film:

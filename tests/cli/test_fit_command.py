@@ -103,6 +103,20 @@ def test_it_takes_the_model_that_is_asked_for(words, description, rtol, tmp_path
     np.testing.assert_allclose(total, SKIN, rtol=rtol)
 
 
+def test_it_takes_normalized_diffusion_of_others(tmp_path, capsys):
+    other, output = tmp_path / "other.toml", tmp_path / "fitted.toml"
+    other.write_text(
+        '[burley]\nunit = "mm"\nalbedo = [0.8, 0.5]\nscattering_distance = [2.0, 1.0]\n'
+    )
+    assert run("fit", other, "--count", 2, "--output", output) == 0
+    material = sj.load_material(output)
+    np.testing.assert_allclose(material.total_reflectance(), [0.8, 0.5], rtol=1e-5)
+    assert material.angles is None
+    assert sj.load_profile(output).length_scale().tolist() == [2.0, 1.0]
+    capsys.readouterr()
+    assert "[burley]" in failure(["fit", other, "--g", "0.5", "--output", output], capsys)
+
+
 def test_it_takes_a_table_and_the_least_count(tmp_path):
     table, output = tmp_path / "measured.csv", tmp_path / "measured.toml"
     r = np.linspace(0.01, 0.5, 40)

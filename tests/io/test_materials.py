@@ -261,7 +261,7 @@ BAD = [
     (GOOD_MEDIUM.replace("eta = 1.3\n", ""), r"\[medium\] eta .* missing"),
     (GOOD_MEDIUM, r"has no \[fit\]"),
     (GOOD_MEDIUM.replace("eta", "=eta"), r"TOML file"),
-    (NO_FIT, r"has no \[medium\], \[openpbr\], \[\[layers\]\], \[skin\] or \[fit\]"),
+    (NO_FIT, r"has no \[medium\], \[openpbr\], \[burley\], \[skin\], \[\[layers\]\] or \[fit\]"),
     ("medium = 3\n", r"\[medium\] must be a table; it is 3"),
     (GOOD_FIT + "[surfaces]\n", r"unknown entry 'surfaces'.*'surface'"),
     (GOOD_MEDIUM.replace("_a", "_A"), r"\[medium\] has an unknown entry 'sigma_A'.*'sigma_a'"),
@@ -290,6 +290,8 @@ BAD = [
         '[openpbr]\nunit = "cm"\nsubsurface_color = 0.5\nsubsurface_radius = -0.2\n',
         r"mean_free_path.*-2",
     ),
+    ('[burley]\nunit = "mm"\nalbedo = 0.5\n', r"\[burley\] has no length; .* radius"),
+    ('[burley]\nunit = "mm"\nalbedo = 1.5\nradius = 2.0\n', r"\[burley\].*albedo .* 1\.5"),
 ]
 
 
@@ -336,3 +338,24 @@ def test_an_exported_openpbr_surface_comes_back_with_its_highlight(tmp_path):
         tmp_path / "it.toml", {"openpbr": {"unit": "mm", **entries}, "surface": {"roughness": 0.5}}
     )
     assert surface_and_source(tmp_path / "it.toml")[0]["roughness"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "length"),
+    [
+        ("scattering_distance", 0.2),
+        ("diffuse_mean_free_path", 0.2 * (3.5 + 100 * 0.17**4)),
+        ("mean_free_path", 0.2 * (1.85 - 0.5 + 7 * 0.3**3)),
+        ("radius", 0.2 * 4 * np.pi * (1.9 - 0.5 + 3.5 * 0.3**2)),
+    ],
+)
+def test_normalized_diffusion_of_others_comes_in_by_its_length(tmp_path, name, length):
+    """Christensen and Burley 2015, of albedo 0.5 and `d` of 2 mm; and back from a file."""
+    path = tmp_path / "other.toml"
+    path.write_text(f'[burley]\nunit = "cm"\nalbedo = 0.5\n{name} = {length}\n')
+    for _ in range(2):
+        profile = load_profile(path)
+        np.testing.assert_allclose(profile.length_scale(), 2.0, rtol=1e-5)
+        np.testing.assert_allclose(profile.total_reflectance(), 0.5)
+        material = sj.Material(sj.SumOfGaussians([1.0], [[0.5]]))
+        save_material(material, path, profile=profile)

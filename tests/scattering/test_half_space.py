@@ -90,7 +90,7 @@ def test_monte_carlo_with_forward_scattering(float32):
 @pytest.mark.once
 @pytest.mark.parametrize("g", [0.0, 0.8, 0.9])
 @pytest.mark.parametrize("eta", [1.0, 1.6])
-def test_white_sends_all_light_back(dtype, eta, g):
+def test_white_sends_all_light_back(eta, g):
     fraction = HalfSpace(sj.Medium([0.0], [1.0], eta), g).directional_albedo()
     np.testing.assert_allclose(fraction, 1, atol=3e-4)
 
