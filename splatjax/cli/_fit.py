@@ -294,9 +294,8 @@ class Fit:
         surface, source = dict[str, Any](), dict[str, Any]()
         if coefficients is not None:
             # The index of a surface is that of the medium it bounds, unless the file gives it.
-            top = (
-                coefficients.top if isinstance(coefficients, sj.LayeredMultipole) else coefficients
-            )
+            is_layered = isinstance(coefficients, sj.LayeredMultipole)
+            top = coefficients.top if is_layered else coefficients
             surface, source = sj.io.surface_and_source(self.medium)
             if not isinstance(top, sj.scattering.Burley):
                 eta = top.eta if isinstance(top, sj.scattering.Skin) else top.medium.eta[0]

@@ -22,7 +22,6 @@ from ._images import (
     write_png as write_png,
 )
 from ._materials import (
-    dipole_starts as dipole_starts,
     list_materials as list_materials,
     load_material as load_material,
     load_mean_cosine as load_mean_cosine,
@@ -35,6 +34,7 @@ from ._materials import (
     save_material as save_material,
     surface_and_source as surface_and_source,
 )
+from ._media import dipole_starts as dipole_starts
 from ._tables import (
     read_columns as read_columns,
     read_media as read_media,

@@ -5,14 +5,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from splatjax._library import profiles_folder as profiles_folder
 from splatjax._records import check_values
 from splatjax.exports import plain_numbers
-from splatjax.fitting import DipoleStarts
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
     AngularLaw,
@@ -323,18 +321,3 @@ def _description(profile: _Stored) -> str:
     layers = f" of {len(profile.layers)} layers" if isinstance(profile, LayeredMultipole) else ""
     moments = "exact" if isinstance(profile.fresnel, ExactFresnel) else "fitted"
     return f"{_MODELS[type(profile)]}{layers}, {moments} Fresnel moments"
-
-
-def dipole_starts() -> DipoleStarts:
-    r"""Read the starts of fits of 1 to 8 Gaussians to dipoles; one descent then replaces a search.
-
-        fit_gaussians(Dipole(medium), 6, spread=VariancesPerChannel(), start=dipole_starts()(medium,
-        6))
-
-    **Returns:** a `DipoleStarts` in JAX's default precision. `tools/make_profiles.py` made it.
-    """
-    with np.load(profiles_folder() / "dipole_starts.npz") as file:
-        tables = {name: jnp.asarray(table, float) for name, table in file.items()}
-    counts = sum(name.startswith("log_variances_") for name in tables)
-    log_variances = tuple(tables[f"log_variances_{count}"] for count in range(1, counts + 1))
-    return DipoleStarts(tables["roots"], tables["etas"], log_variances)

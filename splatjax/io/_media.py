@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from splatjax._library import profiles_folder
 from splatjax._records import check_values
 from splatjax.exports import plain_numbers
+from splatjax.fitting import DipoleStarts
 from splatjax.scattering import (
     Burley,
     Film,
@@ -152,3 +154,18 @@ def digest_of(tables: Mapping[str, Any]) -> str | None:
     optics = {kind: tables[kind] for kind in KINDS if kind in tables}
     plain = json.dumps(optics, sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:16] if optics else None
+
+
+def dipole_starts() -> DipoleStarts:
+    r"""Read the starts of fits of 1 to 8 Gaussians to dipoles; one descent then replaces a search.
+
+        fit_gaussians(Dipole(medium), 6, spread=VariancesPerChannel(), start=dipole_starts()(medium,
+        6))
+
+    **Returns:** a `DipoleStarts` in JAX's default precision. `tools/make_profiles.py` made it.
+    """
+    with np.load(profiles_folder() / "dipole_starts.npz") as file:
+        tables = {name: jnp.asarray(table, float) for name, table in file.items()}
+    counts = sum(name.startswith("log_variances_") for name in tables)
+    log_variances = tuple(tables[f"log_variances_{count}"] for count in range(1, counts + 1))
+    return DipoleStarts(tables["roots"], tables["etas"], log_variances)

@@ -82,15 +82,12 @@ class ShadowSettings(eqx.Module):
         """Return the settings with the resolution for a spacing of the splats, mm: a power of 2 at
         most, so that maps of other bodies share its program. Not for traced arrays.
         """
-        across, filled = self.pixels_per_spacing * 2 * float(bounds.radius), self.resolution
-        if across < filled * spacing:
-            finest = rounded_up(max(int(across / spacing), 1), _LEAST_RESOLUTION, per_octave=2)
-            filled = min(finest, filled)
-        return dataclasses.replace(
-            self,
-            resolution=min(1 << (filled - 1).bit_length(), self.resolution),
-            filled=jax.device_put(np.asarray(filled, bounds.radius.dtype)),
-        )
+        across = self.pixels_per_spacing * 2 * float(bounds.radius)
+        pixels = int(min(across / spacing, self.resolution)) if spacing else self.resolution
+        filled = rounded_up(max(pixels, 1), _LEAST_RESOLUTION, per_octave=2)
+        filled = np.asarray(min(filled, self.resolution), bounds.radius.dtype)
+        size = min(1 << (int(filled) - 1).bit_length(), self.resolution)
+        return dataclasses.replace(self, resolution=size, filled=jax.device_put(filled))
 
     def splats_per_disc(self, spacing: float, bounds: "Bounds") -> int:
         """Return the number of splats in each merged disc. Not for traced arrays."""
@@ -141,13 +138,12 @@ def distant_view(
     direction: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings
 ) -> OrthographicView:
     """Make the view of a directional light: the bounding sphere in parallel projection."""
-    size = settings.resolution
     return OrthographicView(
         position=bounds.center,
         rotation=_rotation_towards(direction / jnp.linalg.norm(direction)),
         scale=0.5 * (settings.side - 4) / bounds.radius,
-        width=size,
-        height=size,
+        width=settings.resolution,
+        height=settings.resolution,
     )
 
 
@@ -174,7 +170,6 @@ def near_view(
 def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[PerspectiveView]:
     """Make the views of a point light inside the bounding sphere: six faces of a cube."""
     size, dtype = settings.resolution, position.dtype
-    axes = jnp.concatenate([jnp.eye(3, dtype=dtype), -jnp.eye(3, dtype=dtype)])
     # Two pixels beyond each edge, for the filter.
     focal_length = jnp.asarray(0.5 * (settings.side - 4), dtype)
     return [
@@ -186,7 +181,7 @@ def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[Pe
             height=size,
             near=_NEAR,
         )
-        for axis in axes
+        for axis in jnp.concatenate([jnp.eye(3, dtype=dtype), -jnp.eye(3, dtype=dtype)])
     ]
 
 
