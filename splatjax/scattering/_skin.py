@@ -184,9 +184,9 @@ class Skin(eqx.Module):
 
     **Source:** two layers, melanins and baseline: Donner and Jensen 2006; scattering of skin, a
     mean over published measurements: Jacques 2013; eumelanin's share: Del Bino et al. 2015;
-    vessels: Van Veen, Verkruysse and Sterenborg 2002; oxygenation: Caspary et al. 1995,
-    "Quantitative reflection spectrophotometry" (Int. J. Microcirc. 15(3), 131); index, 1.51 to 1.53
-    on cheeks at 550 nm: Yoshida et al. 2013 (J. Biomed. Opt. 18(3), 037002).
+    vessels: Van Veen, Verkruysse and Sterenborg 2002; oxygenation, 52 to 67% at
+    six places: "Quantitative reflection spectrophotometry" (Int. J. Microcirc. 15(3), 131); index,
+    1.51 to 1.53 on cheeks at 550 nm: Yoshida et al. 2013 (J. Biomed. Opt. 18(3), 037002).
     """
 
     melanin: Float[Array, ""] = eqx.field(

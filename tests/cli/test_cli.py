@@ -109,7 +109,7 @@ def test_sample_covers_a_mesh_that_may_have_z_up(tmp_path, capsys):
     assert run(*command, "--up", "z") == 0
     noted = capsys.readouterr().err
     assert "400 splats on 152 mm^2, with no maps" in noted
-    assert "open" not in noted
+    assert "its surface is open" not in noted
     upright = sj.read_splats(output)
     np.testing.assert_allclose(np.abs(np.asarray(upright.normals)).max(axis=1), 1, atol=1e-6)
     assert np.ptp(np.asarray(upright.centers), axis=0).argmax() == 1
