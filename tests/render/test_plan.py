@@ -281,6 +281,7 @@ def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compi
         assert not any(np.array_equal(other, before) for before in [first, *others[:i]])
 
 
+@pytest.mark.once
 def test_a_picture_of_any_size_is_part_of_a_larger_one():
     """Pictures are rendered with further pixels, which are in no result."""
     body = sj.bust(3_000).scaled(0.2)
