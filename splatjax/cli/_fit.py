@@ -63,8 +63,8 @@ class Fit:
         tyro.conf.Positional[str],
         tyro.conf.arg(
             help="Name of a material (`splatjax materials`), or path: of a TOML file with a "
-            "[medium], [openpbr], [[layers]] or [skin], of a CSV file with radii and a column per "
-            "channel, or of an EXR file with a linear photograph of a laser dot."
+            "[medium], [openpbr], [[layers]], [skin] or [burley], of a CSV file with radii and a "
+            "column per channel, or of an EXR file with a linear photograph of a laser dot."
         ),
     ]
     #: Number of Gaussians.

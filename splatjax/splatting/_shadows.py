@@ -51,8 +51,7 @@ class ShadowSettings(eqx.Module):
       that are farther apart than about a third of it are not merged.
     - `largest_slope`: the slope up to which the receiver's plane is continued from pixel to pixel
       of the map. On heads, 4 leaves steps at grazing light, and more than 8 has no effect.
-    - `filled`: pixels along a side of the part of the map that shows the body, `resolution` at
-      most. `None` to derive it from the splats (`for_spacing`).
+    - `filled`: side, in pixels, of the part of the map that shows the body. `None` to derive it.
     """
 
     resolution: int = eqx.field(static=True, default=1024)
@@ -82,6 +81,8 @@ class ShadowSettings(eqx.Module):
         """Return the settings with the resolution for a spacing of the splats, mm: a power of 2 at
         most, so that maps of other bodies share its program. Not for traced arrays.
         """
+        if self.filled is not None:
+            return self
         across = self.pixels_per_spacing * 2 * float(bounds.radius)
         pixels = int(min(across / spacing, self.resolution)) if spacing else self.resolution
         filled = rounded_up(max(pixels, 1), _LEAST_RESOLUTION, per_octave=2)
