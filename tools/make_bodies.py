@@ -162,6 +162,14 @@ BODIES = [
         *FROM_HEAD,
     ),
     Body("bust", f"{BUST}, lit from the front", bust, lamp(-0.7, -0.5, -1), *FROM_BUST),
+    *(
+        Body(f"bust_{name}", f"{BUST}, lit like the studio's {what}", bust, light, *FROM_BUST)
+        for name, what, light in (
+            ("key", "large softbox", lamp(0.41, -0.574, -0.709)),
+            ("fill", "weak softbox", lamp(-0.962, -0.087, -0.258)),
+            ("rim", "strip behind", lamp(-0.453, -0.423, 0.785)),
+        )
+    ),
     Body("bust_studio", f"{BUST} in the studio", bust, STUDIO, *FROM_BUST),
     Body(
         "bust_softbox",
@@ -184,7 +192,8 @@ BODIES = [
 # A frame of the solved head takes one to two minutes.
 UNSOLVED = (
     *("head_studio", "head_refracting", "head_softbox"),
-    *("bust", "bust_studio", "bust_softbox", "ear_refracting"),
+    *("bust", "bust_key", "bust_fill", "bust_rim", "bust_studio", "bust_softbox"),
+    "ear_refracting",
 )
 PICTURED = "sphere", "sphere_refracting", "sheet4", "head", "head_refracting"
 PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"
