@@ -28,7 +28,10 @@ def to_display(
     values = np.asarray(values, np.float64)
     channels = values.shape[-1]
     if channels not in (1, 3, 4):
-        raise ValueError(f"a picture of {channels} channels cannot be shown; give 1, 3 or 4")
+        raise ValueError(
+            f"a picture of {channels} channels cannot be shown; give 1, 3 or 4, or the wavelengths "
+            "of the channels"
+        )
     if not np.isfinite(exposure):
         raise ValueError(f"exposure is {exposure}; it must be a finite number of stops")
     color, alpha = values[..., :3], np.clip(values[..., 3:], 0, 1)

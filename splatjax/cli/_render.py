@@ -47,9 +47,11 @@ _DIRECTIONS = 128  # number of shadow maps of an environment that turns about th
 class PictureOptions(ViewOptions):
     """Options for the contents of a picture's files."""
 
-    #: Background of the PNG: black, transparent, or the environment. The EXR has coverage and no
-    #: background.
+    #: Background of the PNG, not of the EXR: black, transparent, or the environment.
     background: Literal["black", "transparent", "environment"] = "black"
+    #: Light under which the PNG shows the color of a material of wavelengths: D65, A, FL11, or
+    #: another one of colour-science; None if the lights of the scene have spectra of their own.
+    illuminant: str | None = "D65"
     #: Write the EXR in half precision, except for depth and position.
     half: bool = False
 
@@ -73,13 +75,11 @@ class PictureOptions(ViewOptions):
     ) -> tuple[Path, Path]:
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
         material, lights = scene.material, scene.lights
-        picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
+        picture, shown = path.with_suffix(".png"), frame.beauty
         contents = scene_contents(self, settings, path.parent, material, lights, camera)
+        variances = material.gaussians.variances.tolist()
         # The sum of all layers belongs to no Gaussian.
-        is_summed = isinstance(
-            settings.diffuser, sj.diffusion.ExitanceDiffuser | sj.diffusion.ShapeDiffuser
-        )
-        widths = None if is_summed else material.gaussians.variances.tolist()
+        widths = variances if len(frame.weights) == len(variances) else None
         sj.write_exr(
             path,
             frame,
@@ -87,21 +87,21 @@ class PictureOptions(ViewOptions):
             manifest=self.manifest() | {"scene": contents},
             camera=camera,
             half=self.half,
+            wavelengths=material.wavelengths,
         )
         if widths and self.scattering:
             note_unresolved(frame, scene, settings.kernel, count or scene.splats.count)
         if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
-            shown = np.asarray(lights[0].behind(frame, camera))
-        elif self.background == "transparent":
+            shown = lights[0].behind(frame, camera)
+        shown = sj.io.picture_to_rgb(np.asarray(shown), material.wavelengths, self.illuminant)
+        if self.background == "transparent":
             colors = np.repeat(shown, 3 // shown.shape[-1], axis=-1)  # for a scene in gray
             shown = np.concatenate([colors, np.asarray(frame.coverage)[..., None]], axis=-1)
         sj.write_png(picture, shown, exposure=self.exposure)
         return path, picture
 
     def manifest(self) -> dict[str, Any]:
-        """Return everything on which the pictures depend besides a scene's file: options by name,
-        contents of their files, and versions.
-        """
+        """Return what the pictures depend on besides a scene's file: options, files, versions."""
         versions = {"splatjax": sj.__version__, "jax": jax.__version__}
         if self.table is not None:
             return versions
@@ -130,8 +130,7 @@ class Render(PictureOptions):
     are divided by their sums, so that the albedo alone gives the color; with --no-albedo the
     material gives it.
 
-    Examples: splatjax render head.ply --material skin --azimuth 30 --width 1024 --height 1024
-    --output head.exr
+    Examples: splatjax render head.ply --material skin --azimuth 30 --output head.exr
               splatjax render --material marble --no-albedo --output marble.exr
     """
 
@@ -174,9 +173,8 @@ class Render(PictureOptions):
         if self.table is None and self.splats and self.stream:
             pictured = self._streamed(self.splats)
         else:
-            scene, camera, settings = self.open()
-            frame = self._drawn(scene, camera, settings)
-            pictured = frame, scene, camera, settings
+            opened = self.open()
+            pictured = self._drawn(*opened), *opened
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
             written = self.write(self.output, *pictured)
         print(*written, sep="\n")
@@ -193,8 +191,9 @@ class Render(PictureOptions):
         with preview(lambda side: rough_picture(scene, samples, camera, self.exposure, side)):
             with stage("planning"):
                 plan = sj.make_plan(scene, camera, settings)
-            count, width, height = scene.splats.count, camera.width, camera.height
-            with stage(f"rendering {count} splats at {width} x {height}"):
+            with stage(
+                f"rendering {scene.splats.count} splats at {camera.width} x {camera.height}"
+            ):
                 return draw(scene, camera, settings, plan)
 
     def _streamed(self, path: Path) -> tuple[Any, ...]:

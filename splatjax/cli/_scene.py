@@ -128,6 +128,7 @@ def rough_picture(
         np.maximum(splats.normals @ -light.direction, 0)[:, None] * light.irradiance
         for light in lights
     )
+    color = sj.io.picture_to_rgb(color, scene.material.wavelengths)
     local = (splats.centers - camera.position) @ camera.rotation.T
     # Draw splats that face the camera from far to near: nearer ones cover farther ones.
     order = np.argsort(-local[:, 2])

@@ -13,7 +13,7 @@ import tyro
 
 import splatjax as sj
 from splatjax._memory import check_memory
-from splatjax.render import BYTES_PER_PIXEL, BYTES_PER_SPLAT, check_displayable
+from splatjax.render import BYTES_PER_PIXEL, BYTES_PER_SPLAT
 
 from ._scene import direction_to, is_scene
 from ._terminal import (
@@ -32,7 +32,9 @@ _WHITE = 0.995  # least reflectance of a material that counts as white
 # Options of the single light, with their defaults if another of them is given.
 _SINGLE_LIGHT = {"light_azimuth": -20.0, "light_elevation": 30.0, "fill": 0.1}
 # Options that are given beside a scene's file.
-_BESIDE_SCENES = {"splats", "output", "background", "exposure", "half", "quiet", "host", "port"}
+_BESIDE_SCENES = {
+    *("splats", "output", "background", "exposure", "illuminant", "half", "quiet", "host", "port")
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +95,8 @@ class ViewOptions:
     #: Print only the files that are written, and errors.
     quiet: bool = False
 
+    illuminant = "D65"  # an option of pictures
+
     def check(self, more_rules: Rules | None = None) -> None:
         """Raise `ValueError` for options that break a rule, for a material that a PNG file cannot
         show, and for too little memory.
@@ -103,6 +107,9 @@ class ViewOptions:
             check_unused(self, ["count"], f"the splats are those of {self.splats}")
         if self.environment is not None:
             check_unused(self, _SINGLE_LIGHT, "--environment replaces the single light")
+        source = "material" if self.table is None else "splats"
+        material = sj.load_material(self.material_source)
+        is_spectral = material.wavelengths is not None
         rules: Rules = {
             "fill": (0 <= fill < math.inf, "be 0 or more"),
             "scale": (0 < self.scale < math.inf, "be a positive factor"),
@@ -121,13 +128,22 @@ class ViewOptions:
             ),
             "bounces": (self.bounces >= 0, "be 0 or more"),
             "diffusion": (
-                self.diffusion != "shape"
-                or (self.scattering and sj.load_material(self.material).medium is not None),
+                self.diffusion != "shape" or (self.scattering and material.medium is not None),
                 f"be clusters without scattering, or if {self.material} has no [medium]",
+            ),
+            source: (
+                is_spectral or material.channels in (1, 3),
+                "have colors for a PNG file: 1 or 3 channels, or `wavelengths` (nm) in the file of "
+                f"the material; it has {material.channels} channels",
+            ),
+            "illuminant": (
+                is_spectral or self.illuminant == "D65",
+                f"be left out, because {getattr(self, source)} has no wavelengths",
             ),
         }
         check_options(self, rules | (more_rules or {}))
-        check_displayable(sj.load_material(self.material).channels)
+        # Of an unknown illuminant, an error.
+        sj.io.picture_to_rgb(np.zeros(material.channels), material.wavelengths, self.illuminant)
         _ = self._environment  # its file is read before anything is made
         count = 0 if self.splats else self.count
         check_memory(
@@ -207,16 +223,21 @@ class ViewOptions:
         return splats, self.material_for(splats)
 
     def material_for(self, splats: sj.Splats) -> sj.Material:
+        material = sj.load_material(self.material)
         check_options(
             self,
             {
                 "diffusion": (
                     self.diffusion != "shape" or splats.albedo is None,
                     "come with --no-albedo, because the material gives the color",
-                )
+                ),
+                "albedo": (
+                    material.wavelengths is None or splats.albedo is None,
+                    f"be left out (--no-albedo), because {self.material} has wavelengths in place "
+                    "of red, green and blue",
+                ),
             },
         )
-        material = sj.load_material(self.material)
         is_white = float(material.total_reflectance().min()) > _WHITE
         if splats.albedo is not None:
             material = material.white()
@@ -234,7 +255,7 @@ class ViewOptions:
         if material.channels == 1:  # the same weights for red, green and blue
             tiled = jax.tree.map(lambda leaf: jnp.tile(leaf, 3) if leaf.ndim else leaf, material)
             gaussians = replace(tiled.gaussians, variances=material.gaussians.variances)
-            material = replace(tiled, gaussians=gaussians)
+            material = replace(tiled, gaussians=gaussians, wavelengths=None)
         return material if self.scattering else material.opaque()
 
     def adjusted(self, splats: sj.Splats) -> sj.Splats:
@@ -252,7 +273,9 @@ class ViewOptions:
         first_azimuth, elevation, fill = self.single_light
         if self._environment is not None:
             rotation = self.environment_rotation + light_azimuth - first_azimuth
-            return (sj.EnvironmentLight(self._environment.image, rotation),)
+            image, is_rgb = self._environment.image, material.wavelengths is None
+            image = image if is_rgb else image.mean(axis=-1, keepdims=True)
+            return (sj.EnvironmentLight(image, rotation),)
         # Under the first light, a white diffuser that faces it has radiance 1.
         irradiance = np.full(material.channels, np.pi)
         light = sj.DirectionalLight(-direction_to(light_azimuth, elevation), irradiance)

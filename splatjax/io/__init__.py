@@ -15,7 +15,6 @@ from ._files import (
 )
 from ._images import (
     read_exr as read_exr,
-    read_manifest as read_manifest,
     read_picture as read_picture,
     write_animation as write_animation,
     write_exr as write_exr,
@@ -35,11 +34,15 @@ from ._materials import (
     surface_and_source as surface_and_source,
 )
 from ._media import dipole_starts as dipole_starts
+from ._spectra import (
+    illuminant as illuminant,
+    picture_to_rgb as picture_to_rgb,
+    spectrum_to_rgb as spectrum_to_rgb,
+)
 from ._tables import (
     read_columns as read_columns,
     read_media as read_media,
     read_profile as read_profile,
-    spectrum_to_rgb as spectrum_to_rgb,
     write_columns as write_columns,
     write_toml as write_toml,
 )
@@ -65,6 +68,7 @@ from ._scenes import (
     material_of_scene as material_of_scene,
     mesh_of_scene as mesh_of_scene,
     plain_scene as plain_scene,
+    read_manifest as read_manifest,
     scene_table as scene_table,
     save_scene as save_scene,
 )

@@ -15,11 +15,14 @@ from PIL import Image
 
 from splatjax._display import png_of, srgb_to_linear, to_display
 from splatjax._memory import check_memory
+from splatjax._records import Numbers
 from splatjax.scene import Camera, Frame
 
 from ._cameras import camera_matrices
 from ._files import StrPath, atomic_path, check_suffix, existing_file, naming, require
+from ._spectra import SPECTRAL, channel_names, picture_to_rgb
 
+MANIFEST = "splatjax.manifest"  # attribute of the settings of a picture
 _BYTES_PER_VALUE = 24.0  # while decoding in double precision
 
 
@@ -107,6 +110,8 @@ def write_png(
     picture: Frame | Float[Array, "height width _"] | Float[np.ndarray, "height width _"],
     *,
     exposure: float = 0.0,
+    wavelengths: Numbers | None = None,
+    illuminant: str | None = "D65",
 ) -> None:
     r"""Write a picture for an sRGB display, 8 bits, completely or not at all.
 
@@ -117,6 +122,8 @@ def write_png(
       PNG requires).
     - `exposure`: exposure in stops: the values are multiplied by `2^exposure` before they are
       encoded. Values above 1 are clipped.
+    - `wavelengths`: of the channels, nm, such as `material.wavelengths`; their spectra are
+      converted to color under an `illuminant`, as `picture_to_rgb` does.
 
     **Raises:** `ValueError` for another suffix, number of channels, or an exposure that is not
     finite; `FileNotFoundError` when the folder does not exist.
@@ -124,7 +131,8 @@ def write_png(
     check_suffix(path, ".png")
     values = picture.beauty if isinstance(picture, Frame) else picture
     with naming(path):
-        content = png_of(to_display(np.asarray(values), exposure))
+        rgb = picture_to_rgb(np.asarray(values), wavelengths, illuminant)
+        content = png_of(to_display(rgb, exposure))
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
@@ -175,7 +183,7 @@ class _Film(Image.Image):
 
 
 _REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-_WEIGHTS, _VARIANCES, _MANIFEST = "splatjax.weights.", "splatjax.variances", "splatjax.manifest"
+_WEIGHTS, _VARIANCES = "splatjax.weights.", "splatjax.variances"
 _SINGLE = "single_scattering"
 _LARGEST_HALF = 65504.0
 
@@ -188,6 +196,7 @@ def write_exr(
     manifest: Mapping[str, Any] | None = None,
     camera: Camera | None = None,
     half: bool = False,
+    wavelengths: Numbers | None = None,
 ) -> None:
     r"""Write a frame and all its layers to an OpenEXR file, single precision, completely or not at
     all.
@@ -203,8 +212,10 @@ def write_exr(
     | `diffusion1.R G B`, ... | per Gaussian: `diffuse = sum_k weights_k diffusion_k` |
 
     Pictures of another number of channels than 3 have `beauty.1`, `beauty.2`, ..., `albedo.1`, ...
-    instead of R G B. The header contains the weights of the Gaussians (`splatjax.weights.1`, ...: a
-    value per channel) and the color space (linear, Rec. 709 primaries, D65).
+    instead of R G B; with `wavelengths`, `S0.550,000nm`, ..., `albedo.S0.550,000nm`, ..., as in the
+    layout for spectral images of Fichet, Pacanowski and Wilkie 2021. The header contains the
+    weights of the Gaussians (`splatjax.weights.1`, ...: a value per channel) and the color space
+    (linear, Rec. 709 primaries, D65).
 
     **Arguments:**
 
@@ -214,6 +225,7 @@ def write_exr(
       and `worldToNDC` (column and row divided by the size of the picture), as in RenderMan. Both
       multiply row vectors: `[x y z 1] M`, divided by the last entry.
     - `half`: write half precision, except for depth and position.
+    - `wavelengths`: of the channels, nm.
 
     **Raises:** `ValueError` for another suffix than `.exr`, `FileNotFoundError` when the folder
     does not exist.
@@ -232,24 +244,27 @@ def write_exr(
         "splatjax.overflow": float(frame.overflow),
         **{f"{_WEIGHTS}{k}": row.tolist() for k, row in enumerate(weights, 1)},
     }
-    if channels == 3:
+    if wavelengths is not None:
+        header |= {"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"}
+    elif channels == 3:
         header |= {"chromaticities": _REC709_D65, "colorInteropID": "lin_rec709_scene"}
     if variances is not None:
         header[_VARIANCES] = np.asarray(variances, np.float32).tolist()
     if manifest is not None:
-        header[_MANIFEST] = json.dumps(manifest)
+        header[MANIFEST] = json.dumps(manifest)
     if camera is not None:
         header |= camera_matrices(camera)
     planes: dict[str, np.ndarray] = {}
+    names = channel_names(channels, wavelengths)
     has_single = frame.single_scattering is not None
-    for field, names in _layout(channels, len(frame.shadow), gaussians, has_single).items():
+    for field, layer in _layout(names, len(frame.shadow), gaussians, has_single).items():
         values = np.asarray(getattr(frame, field), np.float32)
-        if field != "shadow" and names.ndim:
-            values = np.moveaxis(values, -1, names.ndim - 1)
+        if field != "shadow" and layer.ndim:
+            values = np.moveaxis(values, -1, layer.ndim - 1)
         values = np.ascontiguousarray(values.reshape(-1, *frame.coverage.shape))
         if half and field not in ("depth", "position"):
             values = np.clip(values, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16)
-        planes |= dict(zip(names.ravel(), values, strict=True))
+        planes |= dict(zip(layer.ravel(), values, strict=True))
     with atomic_path(path) as temporary, OpenEXR.File(header, planes) as file:
         try:
             file.write(str(temporary))
@@ -265,21 +280,23 @@ def read_exr(path: StrPath) -> Frame:
     layers of a frame.
     """
     planes, header, _ = read_planes(path)
-    channels = 3 if "R" in planes else sum(name.startswith("beauty.") for name in planes)
+    names = sorted(name for name in planes if name.startswith(SPECTRAL)) or channel_names(
+        3 if "R" in planes else sum(name.startswith("beauty.") for name in planes)
+    )
     gaussians = sum(name.startswith(_WEIGHTS) for name in header)
     lights = sum(name.startswith("shadow") for name in planes)
     has_single = any(name.startswith(_SINGLE) for name in planes)
     try:
         weights = [header[f"{_WEIGHTS}{k}"] for k in range(1, gaussians + 1)]
         arrays = {
-            "weights": np.reshape(weights, (gaussians, channels)),
+            "weights": np.reshape(weights, (gaussians, len(names))),
             "unresolved_fraction": np.reshape(header["splatjax.unresolved_fraction"], gaussians),
             "overflow": np.reshape(header["splatjax.overflow"], ()),
         }
-        for field, names in _layout(channels, lights, gaussians, has_single).items():
-            values = np.asarray([planes[name] for name in names.ravel()])
-            values = values.reshape(*names.shape, *planes["A"].shape)
-            arrays[field] = values if field == "shadow" else np.moveaxis(values, names.ndim - 1, -1)
+        for field, layer in _layout(names, lights, gaussians, has_single).items():
+            values = np.asarray([planes[name] for name in layer.ravel()])
+            values = values.reshape(*layer.shape, *planes["A"].shape)
+            arrays[field] = values if field == "shadow" else np.moveaxis(values, layer.ndim - 1, -1)
     except (KeyError, ValueError) as error:
         raise ValueError(
             f"{path}: lacks {' '.join(str(error).split())}, so it is not a frame; give a file "
@@ -288,40 +305,24 @@ def read_exr(path: StrPath) -> Frame:
     return Frame(**{name: jnp.asarray(array, jnp.float32) for name, array in arrays.items()})
 
 
-def read_manifest(path: StrPath) -> dict[str, Any]:
-    r"""Read the manifest of a picture, as the command line records it: settings, material.
-
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or has no such
-    record.
-    """
-    _, header, _ = read_planes(path)
-    require(
-        isinstance(header.get(_MANIFEST), str),
-        path,
-        "has no record of its settings; give a picture that `splatjax render` wrote",
-    )
-    with naming(path):
-        return json.loads(header[_MANIFEST])
-
-
-def _layout(channels: int, lights: int, gaussians: int, has_single: bool) -> dict[str, np.ndarray]:
+def _layout(names: list[str], lights: int, gaussians: int, has_single: bool) -> dict[str, Any]:
     """Name the planes of each field of a frame: arrays over the axes of the field other than height
     and width.
     """
 
     def colors(layer: str) -> list[str]:
-        return [f"{layer}.{k}" for k in ("RGB" if channels == 3 else range(1, channels + 1))]
+        return [f"{layer}.{name}" for name in names]
 
     color = ["albedo", "irradiance", "diffuse", "specular", *([_SINGLE] if has_single else [])]
     layout: dict[str, Any] = {
-        "beauty": list("RGB") if channels == 3 else colors("beauty"),
+        "beauty": colors("beauty") if "1" in names else names,
         "coverage": "A",
         "depth": "Z",
         **{layer: [f"{layer}.{axis}" for axis in "XYZ"] for layer in ("position", "normal")},
         **{layer: colors(layer) for layer in color},
         "shadow": [f"shadow{k}.Y" for k in range(1, lights + 1)],
         "layers": np.reshape(
-            [colors(f"diffusion{k}") for k in range(1, gaussians + 1)], (gaussians, channels)
+            [colors(f"diffusion{k}") for k in range(1, gaussians + 1)], (gaussians, len(names))
         ),
     }
     return {field: np.asarray(names) for field, names in layout.items()}

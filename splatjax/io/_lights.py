@@ -228,8 +228,8 @@ def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
     return {"kind": kinds[type(light)]} | plain_record(light, **given)
 
 
-def light_of(table: Table, channels: int) -> AbstractLight:
-    """Make a light from a table, with the channels of a picture."""
+def light_of(table: Table, channels: int, in_gray: bool = False) -> AbstractLight:
+    """Make a light from a table, with the channels of a picture, and its image in gray or not."""
     light = _LIGHTS[table.one_of("kind", _LIGHTS)]
     names, given = {"kind", *record_names(light)}, dict[str, Any]()
     if "target" in table.entries and light in _AIMED:
@@ -243,7 +243,8 @@ def light_of(table: Table, channels: int) -> AbstractLight:
             given[aim] = table.make(RectangleLight.facing, center, target, *size, 1.0).edges
     table = Table(table.path, table.name, table.entries, names)
     if light is EnvironmentLight:
-        given["image"] = _environment_image(table)
+        image = _environment_image(table)
+        given["image"] = image.mean(axis=-1, keepdims=True) if in_gray else image
         count = table.entries.get("directions")
         if not isinstance(count, list | None):
             given["directions"] = even_directions(int(table.number("directions")))

@@ -45,7 +45,7 @@ from ._media import (
 from ._tables import Table, nearest, read_toml, write_toml
 
 VARIANCE_UNIT = "mm^2"
-MATERIAL_TABLES = (*KINDS, "surface", "single_scattering", "angles", "source", "fit")
+MATERIAL_TABLES = ("wavelengths", *KINDS, "surface", "single_scattering", "angles", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
 _Stored: TypeAlias = Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin | Burley
 # Names in [fit] of profiles whose coefficients are in the file.
@@ -129,7 +129,8 @@ def load_material(name_or_path: StrPath | Table) -> Material:
 
 
 def surface_and_source(name_or_path: StrPath) -> tuple[dict[str, Any], dict[str, Any]]:
-    r"""Return the surface of a material's file, as arguments of `Material`, and its [source].
+    r"""Return the surface and the wavelengths of a material's file, as arguments of `Material`, and
+    its [source].
 
     **Raises:** `ValueError` as `load_material` does.
     """
@@ -249,6 +250,8 @@ def plain_material(
         )
     if material.angles is not None:
         tables["angles"] = plain_record(material.angles)
+    if material.wavelengths is not None:
+        tables["wavelengths"] = plain_numbers(material.wavelengths)
     return tables | {
         "surface": {name: plain_numbers(getattr(material, name)) for name in _SURFACE},
         "source": dict(source or {}),
@@ -284,7 +287,7 @@ def _tables(name_or_path: StrPath) -> Table:
 def _read(
     material: StrPath | Table,
 ) -> tuple[Table, dict[str, Array], Dipole | LayeredMultipole | Skin | Burley | None]:
-    """Read the tables of a material, its surface, and its coefficients, if any."""
+    """Read the tables of a material, its surface and wavelengths, and its coefficients, if any."""
     tables = material if isinstance(material, Table) else _tables(material)
     path, entries, profile = tables.path, tables.entries, None
     kinds = [KINDS[kind] for kind in KINDS if kind in entries]
@@ -312,6 +315,10 @@ def _read(
         layers = [layer_of(layer) for layer in tables.tables("layers", LAYER_ENTRIES)]
         with naming(f"{path}: [[layers]]"):
             profile = LayeredMultipole(layers)
+    if "wavelengths" in entries:
+        surface["wavelengths"] = nodes = tables.numbers("wavelengths")
+        channels = profile.medium.channels if isinstance(profile, Dipole) else nodes.size
+        tables.make(Material, SumOfGaussians([1.0], [[1.0] * channels]), wavelengths=nodes)
     return tables, surface, profile
 
 

@@ -2,6 +2,7 @@
 picture also describes a scene.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +16,8 @@ from splatjax.render import RenderSettings
 from splatjax.scene import Camera, EnvironmentLight, Material, Scene, Splats
 
 from ._cameras import load_camera, resized
-from ._files import StrPath, plain_record, record_names, require
-from ._images import read_manifest
+from ._files import StrPath, naming, plain_record, record_names, require
+from ._images import MANIFEST, read_planes
 from ._lights import LIGHT_ENTRIES, PLACE, light_of, look_at, plain_light, write_image
 from ._materials import MATERIAL_TABLES, load_material, plain_material
 from ._meshes import read_textured_mesh, sample_mesh
@@ -73,7 +74,10 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
     else:
         material = file.make(load_material, source)
         material = material if splats.albedo is None else material.white()
-    lights = [light_of(light, material.channels) for light in file.tables("lights", LIGHT_ENTRIES)]
+    lights = [
+        light_of(light, material.channels, material.wavelengths is not None)
+        for light in file.tables("lights", LIGHT_ENTRIES)
+    ]
     table = file.table("settings", ("bounces", "diffusion"))
     settings = table.make(
         RenderSettings,
@@ -100,6 +104,22 @@ def scene_table(path: StrPath) -> Table:
     table = Table(path, "", scene, _TABLES)
     table.entries.setdefault("settings", {})
     return table
+
+
+def read_manifest(path: StrPath) -> dict[str, Any]:
+    r"""Read the manifest of a picture, as the command line records it: settings, material.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or has no such
+    record.
+    """
+    _, header, _ = read_planes(path)
+    require(
+        isinstance(header.get(MANIFEST), str),
+        path,
+        "has no record of its settings; give a picture that `splatjax render` wrote",
+    )
+    with naming(path):
+        return json.loads(header[MANIFEST])
 
 
 def material_of_scene(file: Table) -> StrPath | Table:

@@ -1,5 +1,5 @@
-"""Tables in files: TOML, with errors that name the valid entries; measured profiles and media as
-CSV; and the tables of colour-science, from spectra to color.
+"""Tables in files: TOML, with errors that name the valid entries, and measured profiles and media
+as CSV.
 """
 
 import csv
@@ -18,7 +18,6 @@ import numpy as np
 import tomli_w
 from jaxtyping import Array, Float
 
-from splatjax._records import Numbers, check_values
 from splatjax.scattering import Tabulated
 
 from ._files import StrPath, atomic_path, check_units, existing_file, naming, require
@@ -155,7 +154,7 @@ def _as_toml(value: Any) -> str:
 def nearest(name: str, choices: Iterable[str]) -> str:
     """Suggest the known name that is nearest to an unknown one, or list all of them."""
     choices = sorted(choices)
-    near = difflib.get_close_matches(name.lower(), choices, n=1)
+    near = [n for own in (name.lower(), name) for n in difflib.get_close_matches(own, choices, 1)]
     return f"did you mean {near[0]!r}?" if near else f"known are {', '.join(choices)}"
 
 
@@ -289,42 +288,3 @@ def _number(cell: str) -> float | None:
         return float(cell)
     except ValueError:
         return None
-
-
-def spectrum_to_rgb(
-    wavelengths: Numbers, illuminant: str = "D65"
-) -> Float[np.ndarray, "wavelengths rgb"]:
-    r"""Compute the matrix from a spectrum to linear sRGB: `spectrum @ matrix`, for the standard
-    observer of CIE 1931.
-
-    The spectrum is linear between the wavelengths and constant beyond them. A surface that reflects
-    all light has the color (1, 1, 1) under every illuminant; the color of the light is a property
-    of the lights of a scene.
-
-    **Arguments:**
-
-    - `wavelengths`: nm, ascending.
-    - `illuminant`: name in colour-science of an illuminant (`colour.SDS_ILLUMINANTS`): "D65", "A",
-      "FL11", ..., or of a measured lamp (`colour.SDS_LIGHT_SOURCES`): "Philips TL-84", ...
-
-    **Returns:** one row for each wavelength; the sum of each column is 1.
-
-    **Raises:** `ValueError` for wavelengths that do not ascend or cannot be seen, and for an
-    unknown name.
-    """
-    import colour  # takes two seconds
-
-    nodes = np.asarray(wavelengths, np.float64)
-    check_values("the steps of wavelengths", np.diff(nodes), "positive (nm)", lambda x: x > 0)
-    if not nodes.size or nodes[0] > 780 or nodes[-1] < 380:
-        raise ValueError(f"wavelengths {nodes.tolist()} must be nm that the eye sees, 380 to 780")
-    lights = {**colour.SDS_ILLUMINANTS, **colour.SDS_LIGHT_SOURCES}
-    if illuminant not in lights:
-        raise ValueError(f"illuminant {illuminant!r} is unknown; {nearest(illuminant, lights)}")
-    shape = colour.SpectralShape(380, 780, 1)
-    light = lights[illuminant].copy().align(shape).values
-    seen = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape).values
-    hats = [np.interp(shape.wavelengths, nodes, hat) for hat in np.eye(len(nodes))]
-    xyz = np.asarray(hats) @ (light[:, None] * seen)
-    rgb = xyz @ colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB.T
-    return rgb / rgb.sum(axis=0)

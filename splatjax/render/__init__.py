@@ -16,7 +16,6 @@ from ._devices import map_over as map_over
 from ._checks import (
     BYTES_PER_PIXEL as BYTES_PER_PIXEL,
     BYTES_PER_SPLAT as BYTES_PER_SPLAT,
-    check_displayable as check_displayable,
     check_scene as check_scene,
 )
 from ._jacobian import picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian

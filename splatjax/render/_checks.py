@@ -80,15 +80,6 @@ def check_planned(scenes: list[Scene], cameras: list[Camera]) -> None:
             )
 
 
-def check_displayable(channels: int) -> None:
-    """Raise `ValueError` for a number of channels that a PNG file cannot show, before rendering."""
-    if channels not in (1, 3):
-        raise ValueError(
-            f"a picture of {channels} channels has no colors for a PNG file; convert the material "
-            "to 1 or 3 channels, or write an EXR file from Python"
-        )
-
-
 @functools.cache
 def _warn_once(message: str) -> None:
     """Warn once per message: Python's own record is reset whenever a library changes filters."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax._records import numbers, record, valid
+from splatjax._records import check_values, numbers, record, valid
 from splatjax.fitting import (
     AbstractModel,
     FixedTotalReflectance,
@@ -47,9 +47,12 @@ class Material(eqx.Module):
       dependence.
     - `medium`: coefficients, which `ShapeDiffuser` uses instead of Gaussians, single scattering and
       angles; or `None`.
+    - `wavelengths`: of the channels, nm, ascending; `None` for channels such as red, green and
+      blue. They determine the colors of pictures (`io.picture_to_rgb`), and not the light.
 
-    **Raises:** `ValueError` for a value out of range, and if `single_scattering` or `angles` has
-    another number of channels than the Gaussians.
+    **Raises:** `ValueError` for a value out of range, for wavelengths that do not ascend, and if
+    `single_scattering`, `angles` or `wavelengths` has another number of channels than the
+    Gaussians.
     """
 
     gaussians: SumOfGaussians
@@ -65,8 +68,15 @@ class Material(eqx.Module):
     single_scattering: SingleScattering | None = None
     angles: AngularLaw | None = None
     medium: Medium | None = None
+    wavelengths: Float[Array, " channels"] | None = eqx.field(
+        converter=numbers,
+        default=None,
+        metadata=valid("between 360 and 830 (nm)", lambda x: (x >= 360) & (x <= 830)),
+    )
 
     def __check_init__(self):
+        steps = jnp.diff(self.wavelengths) if isinstance(self.wavelengths, jax.Array) else None
+        check_values("the steps of Material.wavelengths", steps, "positive (nm)", lambda x: x > 0)
         for name in ("single_scattering", "angles"):
             term = getattr(self, name)
             if term is not None and term.channels != self.channels:
@@ -140,7 +150,9 @@ class Material(eqx.Module):
 
     def surface_of(self, gaussians: SumOfGaussians, angles: AngularLaw | None = None) -> "Material":
         """Return a material with other Gaussians and this surface, without single scattering."""
-        return Material(gaussians, self.eta, self.specular, self.roughness, angles=angles)
+        return dataclasses.replace(
+            self, gaussians=gaussians, angles=angles, single_scattering=None, medium=None
+        )
 
     def opaque(self) -> "Material":
         """Replace scattering by one Gaussian of the total reflectance, narrower than any splat."""

@@ -32,7 +32,8 @@ sj.cache.keep()
 here = Path(__file__).parent
 scene, camera, settings = sj.io.load_scene(here / "{name}.toml")
 frame = sj.render(scene, camera, settings)
-sj.write_png(here / "{name}.png", frame, exposure={exposure})
+wavelengths = scene.material.wavelengths
+sj.write_png(here / "{name}.png", frame, exposure={exposure}, wavelengths=wavelengths)
 '''
 
 
@@ -70,7 +71,12 @@ def save(
     name = next(name for n in range(len(taken) + 1) if (name := f"studio_{n:03}") not in taken)
     paths = [folder / f"{name}{suffix}" for suffix in SUFFIXES[kind]]
     if kind == "PNG":
-        write_png(paths[0], session.frame(controls), exposure=controls.exposure)
+        write_png(
+            paths[0],
+            session.frame(controls),
+            exposure=controls.exposure,
+            wavelengths=scene.material.wavelengths,
+        )
     elif kind == "EXR":
         frame, variances = session.frame(controls), scene.material.gaussians.variances
         write_exr(
@@ -79,6 +85,7 @@ def save(
             variances=variances.tolist() if len(frame.weights) == len(variances) else None,
             manifest={"scene": record} if record else None,
             camera=camera,
+            wavelengths=scene.material.wavelengths,
         )
     elif kind == "material":
         save_material(

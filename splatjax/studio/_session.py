@@ -13,7 +13,7 @@ from splatjax._chunking import rounded_up
 from splatjax._display import to_display
 from splatjax._records import Numbers
 from splatjax.gaussians import SumOfGaussians
-from splatjax.io import spectrum_to_rgb
+from splatjax.io import picture_to_rgb, spectrum_to_rgb
 from splatjax.render import (
     DiffusionBasis,
     Plan,
@@ -207,16 +207,15 @@ class Session:
         """
         widest = 3 * np.sqrt(np.max(self.own.material.gaussians.variances))
         radii = jnp.asarray(np.geomspace(0.01 * widest, widest, 120), self._variances.dtype)
-        rows = profile_curves(
-            self.model(controls), self.optics(controls), self._fitted(controls), radii
-        )
-        return [np.asarray(row, np.float64) for row in (radii, *rows)]
+        inputs = self.model(controls), self.optics(controls), self._fitted(controls), radii
+        return [np.asarray(row, np.float64) for row in (radii, *profile_curves(*inputs))]
 
     def model(self, controls: Controls) -> _fitting.AbstractModel:
         """Return the model that fits Gaussians to the coefficients or pigments of a state."""
-        if self.skin is not None:
-            return _fitting.SkinModel(spectrum_to_rgb(self.skin.wavelengths))
-        return _fitting.TransportModel(jnp.asarray(controls.g, self._variances.dtype))
+        if self.skin is None:
+            return _fitting.TransportModel(jnp.asarray(controls.g, self._variances.dtype))
+        is_rgb, nodes = self.own.material.wavelengths is None, self.skin.wavelengths
+        return _fitting.SkinModel(spectrum_to_rgb(nodes) if is_rgb else np.eye(len(nodes)))
 
     def optics(self, controls: Controls) -> Optics | None:
         """Return the medium or the skin of a state, if it has one."""
@@ -323,8 +322,9 @@ class Session:
         else:
             keys = self._keys(controls, body)
             frame = body.keep("frame", keys, lambda: self.frame(controls, body))
-            shadow = jnp.mean(frame.shadow, axis=0)[..., None]
+            shadow = jnp.broadcast_to(jnp.mean(frame.shadow, 0)[..., None], frame.beauty.shape)
             shown = {"shadow": shadow, "irradiance": frame.irradiance / jnp.pi}
             values = shown.get(controls.layer, getattr(frame, controls.layer))
-        image = to_display(np.asarray(values), controls.exposure)
+        rgb = picture_to_rgb(np.asarray(values), self.own.material.wavelengths)
+        image = to_display(rgb, controls.exposure)
         return np.broadcast_to(image, (*image.shape[:2], 3))

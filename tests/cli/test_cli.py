@@ -215,6 +215,29 @@ def test_a_material_of_one_channel_has_three(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.once
+def test_wavelengths_have_color_under_an_illuminant(tmp_path, capsys):
+    """And in an environment, which lights all of them alike; in the scene of the picture too."""
+    nodes, path = [450.0, 530.0, 600.0, 650.0], tmp_path / "four.exr"
+    material = sj.Material(sj.SumOfGaussians([0.5], [[0.1, 0.2, 0.5, 0.6]]), wavelengths=nodes)
+    sj.save_material(material, tmp_path / "four.toml")
+    options = "--illuminant A --environment sun --count 400 --width 32 --height 32 --output"
+    words = ["render", "--material", tmp_path / "four.toml", *options.split(), path]
+    assert run(*words) == 2
+    assert "(--no-albedo), because" in capsys.readouterr().err
+    assert run(*words, "--no-albedo") == 0
+    again, options = tmp_path / "again.exr", "--illuminant A --background transparent"
+    assert run("render", path, "--output", again, *options.split()) == 0
+    frame = sj.read_exr(path)
+    np.testing.assert_allclose(sj.read_exr(again).beauty, frame.beauty, atol=1e-5)
+    rgb = sj.io.picture_to_rgb(np.asarray(frame.beauty), nodes, "A")
+    picture, over = (np.asarray(Image.open(p.with_suffix(".png"))) for p in (path, again))
+    np.testing.assert_allclose(picture / 255, sj.io.linear_to_srgb(rgb), atol=0.51 / 255)
+    covered = np.asarray(frame.coverage) == 1
+    np.testing.assert_array_equal(over[covered], np.insert(picture[covered], 3, 255, axis=-1))
+
+
+@pytest.mark.slow
 @pytest.mark.long
 def test_render_without_scattering_is_lambertian(tmp_path):
     splats, output = plate(tmp_path / "plate.ply"), tmp_path / "plate.exr"

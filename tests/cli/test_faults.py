@@ -35,17 +35,19 @@ eta = 1.5
 roughness = 0.11
 specular = 0.07
 """
-MEDIA = {
-    "negative.toml": MEDIUM.replace("0.0021", "-0.03"),
-    "thin.toml": MEDIUM.replace("eta = 1.5", "eta = 0.5"),
-    "misspelt.toml": MEDIUM.replace("roughness", "roughnes"),
-    "two.toml": """[fit]
+TWO = """[fit]
 unit = "mm^2"
 variances = [0.5, 2.0]
 weights = [[0.3, 0.4], [0.2, 0.5]]
 [surface]
 eta = 1.5
-""",
+"""
+MEDIA = {
+    "negative.toml": MEDIUM.replace("0.0021", "-0.03"),
+    "thin.toml": MEDIUM.replace("eta = 1.5", "eta = 0.5"),
+    "misspelt.toml": MEDIUM.replace("roughness", "roughnes"),
+    "two.toml": TWO,
+    "spectral.toml": f"wavelengths = [480, 600]\n{TWO}",
     "media.csv": "name,sigma_a,sigma_s_prime,eta\na,0.002,2.6,1.5\n",
     "dark.toml": "[skin]\nmelanin = 0.15\n",
     "scene.toml": 'material = "marble"\n',
@@ -76,7 +78,9 @@ REFUSED = {
     "render plate.ply --material negative.toml": ["negative.toml", "sigma_a"],
     "fit thin.toml": ["thin.toml", "eta must be at least 1"],
     "fit misspelt.toml": ["'roughnes'", "'roughness'"],
-    "render plate.ply --material two.toml": ["2 channels", "PNG", "1 or 3"],
+    "render plate.ply --material two.toml": ["2 channels", "PNG", "`wavelengths`", "1 or 3"],
+    "render plate.ply --material spectral.toml --illuminant D66": ["'D66'", "'D65'"],
+    "render plate.ply --material marble --illuminant A": ["--illuminant is A", "marble"],
     # Outputs.
     "render --output none/o.exr": ["none/o.exr", "no folder"],
     "render --output o.png": ["o.png", ".exr"],

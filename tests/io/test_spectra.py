@@ -5,9 +5,11 @@ import sys
 from dataclasses import replace
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import PLAIN, assert_refused, sphere, view
+from bodies import PLAIN, assert_refused, camera_over, sheet, sphere, view
+from PIL import Image
 
 import splatjax as sj
 
@@ -23,6 +25,23 @@ LOCUS = {
 NEAR = 0.1  # the eye sees a difference of one or two
 SURFACE = (0.5 / 2.5) ** 2  # what an index of 1.5 reflects along the normal
 SIX = [0.02, 0.04, 0.07, 0.11, 0.17, 0.26]  # melanin from light to dark
+
+
+def tristimulus(reflectance, illuminant):
+    """Compute X, Y and Z of a surface, Y 1 for a white one, by colour-science."""
+    import colour
+
+    shape = colour.SpectralShape(380, 780, 1)
+    fine = np.interp(shape.wavelengths, WAVELENGTHS, reflectance)
+    light, observer = (
+        table.copy().align(shape)
+        for table in (
+            colour.SDS_ILLUMINANTS[illuminant],
+            colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"],
+        )
+    )
+    patch = colour.SpectralDistribution(fine, shape)
+    return colour.sd_to_XYZ(patch, observer, light, method="Integration") / 100
 
 
 @pytest.mark.parametrize("illuminant", ["D65", "A", "FL11", "Philips TL-84"])
@@ -104,6 +123,96 @@ def test_a_projected_picture_is_the_picture_of_projected_weights():
     np.testing.assert_allclose(picture(weights) @ matrix, three, atol=1e-5)
 
 
+@pytest.fixture(scope="module")
+def patch():
+    """A flat matte patch of the reflectance of a red, in 31 wavelengths, under gray light."""
+    reflectance = 0.05 + 0.6 / (1 + np.exp((590 - WAVELENGTHS) / 12.0))
+    gaussians = sj.SumOfGaussians([1e-6], reflectance[None])
+    material = sj.Material(gaussians, eta=1.0, specular=0.0, wavelengths=WAVELENGTHS)
+    light = sj.DirectionalLight([0, 0, -1], np.pi, cast_shadows=False)
+    return sj.Scene(sheet(16.0, 1.0), light, material), camera_over(4.0, 8), PLAIN
+
+
+@pytest.mark.parametrize("illuminant", ["D65", "A", "FL11", "LED-B1"])
+def test_a_patch_in_gray_light_has_the_color_of_a_lamp(patch, illuminant, tmp_path):
+    """To the eye adapted to the lamp: relative to white in linear sRGB."""
+    import colour
+
+    frame, material = sj.render(*patch), patch[0].material
+    rgb = sj.io.picture_to_rgb(frame.beauty, material.wavelengths, illuminant)
+    ours, white = material.total_reflectance(), np.ones(31)
+    patch_rgb, white_rgb = (
+        colour.XYZ_to_sRGB(tristimulus(each, illuminant), apply_cctf_encoding=False)
+        for each in (ours, white)
+    )
+    np.testing.assert_allclose(rgb[4, 4], patch_rgb / white_rgb, rtol=1e-3)
+    path, nodes = tmp_path / "patch.png", material.wavelengths
+    sj.write_png(path, frame, wavelengths=nodes, illuminant=illuminant)
+    with Image.open(path) as image:
+        encoded = sj.io.linear_to_srgb(np.asarray(rgb))
+        np.testing.assert_allclose(np.asarray(image) / 255, encoded, atol=1 / 255)
+
+
+@pytest.mark.parametrize(("illuminant", "error"), [("D65", 0.1), ("A", 0.3), ("FL11", 0.7)])
+def test_a_lamp_lights_a_patch_as_its_spectrum_does(patch, illuminant, error):
+    """By the Delta E of docs/howto/fit.md: 31 samples of a lamp times those of the patch are less
+    than the product of both spectra.
+    """
+    import colour
+
+    scene, camera, settings = patch
+    lamp = sj.io.illuminant(illuminant, WAVELENGTHS)
+    lit = replace(scene, lights=sj.DirectionalLight([0, 0, -1], np.pi * lamp, cast_shadows=False))
+    frame = sj.render(lit, camera, settings)
+    rgb = np.asarray(sj.io.picture_to_rgb(frame.beauty, WAVELENGTHS, None), float)[4, 4]
+    to_rgb = colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB
+    both = (
+        np.linalg.solve(to_rgb, rgb),
+        tristimulus(scene.material.gaussians.weights[0], illuminant),
+    )
+    white = colour.XYZ_to_xy(tristimulus(np.ones(31), illuminant))
+    lab = (colour.XYZ_to_Lab(xyz, white) for xyz in both)
+    assert colour.delta_E(*lab, method="CIE 2000") < error
+    one = np.linalg.solve(to_rgb, lamp @ sj.io.spectrum_to_rgb(WAVELENGTHS, None))
+    np.testing.assert_allclose(one[1], 1, rtol=1e-12)
+
+
+def test_spectral_layers_come_back_and_are_read_by_colour_science(patch, tmp_path):
+    import colour
+
+    path, frame = tmp_path / "patch.exr", sj.render(*patch)
+    sj.write_exr(path, frame, wavelengths=WAVELENGTHS)
+    assert eqx.tree_equal(sj.read_exr(path), frame)
+    nodes, picture = colour.io.read_spectral_image_Fichet2021(path)["S0"]
+    np.testing.assert_array_equal(nodes, WAVELENGTHS)
+    np.testing.assert_array_equal(picture, frame.beauty)
+    assert_refused(lambda: sj.write_exr(path, frame, wavelengths=[500, 600]), "must be 31")
+    assert_refused(lambda: sj.write_png(tmp_path / "a.png", frame), "31 channels")
+    assert_refused(
+        lambda: sj.write_png(tmp_path / "a.png", frame, wavelengths=[500, 600]), "must be 31"
+    )
+
+
+def test_a_material_keeps_its_wavelengths(tmp_path):
+    weights = np.linspace(0.1, 0.2, 10).reshape(2, 5)
+    nodes, gaussians = [420, 480.5, 550, 610, 690], sj.SumOfGaussians([0.5, 9.0], weights)
+    material = sj.Material(gaussians, wavelengths=nodes)
+    sj.save_material(material, tmp_path / "five.toml")
+    assert eqx.tree_equal(sj.load_material(tmp_path / "five.toml"), material)
+    for other in (material.white(), material.opaque()):
+        np.testing.assert_array_equal(other.wavelengths, jnp.asarray(nodes))
+    for wrong, message in (
+        ([500, 600], r"wavelengths has shape \[2\].*\[5\]"),
+        ([420, 550, 480, 610, 690], "steps of Material.wavelengths must be positive"),
+        ([42, 48, 55, 61, 69], "wavelengths must be between 360 and 830"),
+    ):
+        assert_refused(lambda wrong=wrong: sj.Material(gaussians, wavelengths=wrong), message)
+    stone = tmp_path / "stone.toml"
+    medium = '[medium]\nunit = "1/mm"\nsigma_a = [0.1, 0.2]\nsigma_s_prime = 1.0\neta = 1.3\n'
+    stone.write_text(f"wavelengths = [450, 550, 650]\n{medium}")
+    assert_refused(lambda: sj.load_medium(stone), r"stone.toml.*wavelengths has shape \[3\]")
+
+
 def test_pigments_to_weights_are_one_program():
     """In a process of its own: where all channels were computed at once, it never ended."""
     program = """
@@ -123,10 +232,8 @@ np.testing.assert_allclose(*fit(sj.scattering.Skin()), rtol=1e-4)
 
 
 def test_an_unknown_illuminant_is_named():
-    assert_refused(
-        lambda: sj.io.spectrum_to_rgb(WAVELENGTHS, "D66"),
-        "illuminant 'D66' is unknown; known are .* A, B",
-    )
+    assert_refused(lambda: sj.io.illuminant("D66", WAVELENGTHS), "'D66' is unknown; .* 'D65'")
+    assert_refused(lambda: sj.io.spectrum_to_rgb(WAVELENGTHS, "?"), "'\\?' is unknown; .* A, B")
     assert_refused(lambda: sj.io.spectrum_to_rgb([500, 450]), "wavelengths must be positive")
     for unseen in ([5000, 6000], []):
         assert_refused(lambda unseen=unseen: sj.io.spectrum_to_rgb(unseen), "wavelengths .* 780")

@@ -175,6 +175,24 @@ def test_pigments_change_skin_as_a_fit_does(skin_studio, tmp_path):
         assert eqx.tree_equal(sj.io.load_skin(path), skin_studio.optics(controls))
 
 
+@pytest.mark.slow
+@pytest.mark.once
+def test_wavelengths_are_shown_in_color(another):
+    nodes = [450.0, 530.0, 600.0, 650.0]
+    gaussians = sj.SumOfGaussians([0.5, 2.0], [[0.05, 0.1, 0.2, 0.2], [0.05, 0.1, 0.3, 0.4]])
+    material = sj.Material(gaussians, wavelengths=nodes)
+    skin, light = sj.scattering.Skin(wavelengths=nodes), sj.DirectionalLight([1, -0.3, -1], 3.0)
+    studio = another(material=material, skin=skin, lights=[light])
+    for layer in ("beauty", "shadow"):
+        controls = with_(studio.start, layer=layer)
+        frame = studio.frame(controls)
+        values = frame.beauty if layer == "beauty" else np.repeat(frame.shadow[0][..., None], 4, 2)
+        rgb = sj.io.picture_to_rgb(np.asarray(values), nodes)
+        expected = sj._display.to_display(rgb).astype(int)
+        assert np.abs(expected - studio.picture(controls)).max() <= SAME
+    assert len(studio.curves(studio.start)) == 1 + 4 + 4
+
+
 def test_a_pixel_of_skin_changes_with_its_pigments(skin_studio):
     start = skin_studio.start
     skin_studio.picture(start)

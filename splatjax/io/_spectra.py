@@ -1,0 +1,112 @@
+"""Spectra as colors, and the spectra of lamps, by the tables of colour-science."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from splatjax._records import Numbers, check_values
+
+from ._tables import nearest
+
+SPECTRAL = "S0."  # begin of the names of channels of wavelengths: the first Stokes component
+_COUNT = "the number of wavelengths"
+_GRID = np.arange(380.0, 781.0)  # nm
+
+
+def spectrum_to_rgb(
+    wavelengths: Numbers, illuminant: str | None = "D65"
+) -> Float[np.ndarray, "wavelengths rgb"]:
+    r"""Compute the matrix from a spectrum to linear sRGB: `spectrum @ matrix`, for the standard
+    observer of CIE 1931.
+
+    The spectrum is linear between the wavelengths and constant beyond them. A surface that reflects
+    all light has the color (1, 1, 1) under every illuminant; the color of the light is a property
+    of the lights of a scene.
+
+    **Arguments:**
+
+    - `wavelengths`: nm, ascending.
+    - `illuminant`: name in colour-science of an illuminant (`colour.SDS_ILLUMINANTS`): "D65", "A",
+      "FL11", ..., or of a measured lamp (`colour.SDS_LIGHT_SOURCES`): "Philips TL-84", ...; the
+      spectrum is then a reflectance. `None`: the spectrum is that of light itself, as under lights
+      whose colors are spectra. Daylight, D65, then is white, and a spectrum of 1 has luminance 1.
+
+    **Returns:** one row for each wavelength; the sum of each column is 1 with an illuminant.
+
+    **Raises:** `ValueError` for wavelengths that do not ascend or cannot be seen, and for an
+    unknown name.
+    """
+    name = "E" if illuminant is None else illuminant  # of equal energy
+    hats, power, observer, to_rgb = _tables(wavelengths, name)
+    rgb = hats @ (power[:, None] * observer) @ to_rgb.T
+    return rgb / (observer[:, 1].sum() if illuminant is None else rgb.sum(axis=0))
+
+
+def illuminant(name: str, wavelengths: Numbers) -> Float[np.ndarray, " wavelengths"]:
+    r"""Compute the spectrum of a named light, as the color of a light of a scene:
+
+        light = DirectionalLight((0, 0, -1), 3.14 * illuminant("A", material.wavelengths))
+
+    `spectrum_to_rgb(wavelengths, None)` converts its pictures. Each entry is the mean over the band
+    around its wavelength, weighted by the observer, so that narrow lines are not missed.
+
+    **Arguments:** `name`: as in `spectrum_to_rgb`; `wavelengths`: nm, ascending.
+
+    **Returns:** the power at each wavelength, relative to a constant spectrum of 1 of the same
+    luminance: the light is as bright as a gray light.
+
+    **Raises:** `ValueError` as `spectrum_to_rgb` does.
+    """
+    hats, power, observer, _ = _tables(wavelengths, name)
+    shares = hats * observer.sum(axis=1)
+    means = shares @ power / np.maximum(shares.sum(axis=1), 1e-30)
+    return means * observer[:, 1].sum() / (means @ hats @ observer[:, 1])
+
+
+def picture_to_rgb(picture: Any, wavelengths: Numbers | None, illuminant: str | None = "D65"):
+    r"""Convert a picture whose channels are wavelengths to linear sRGB. Differentiable.
+
+    **Arguments:** `picture`: one channel for each wavelength, along the last axis. `wavelengths`,
+    `illuminant`: as in `spectrum_to_rgb`; without wavelengths, the picture is returned unchanged.
+
+    **Raises:** `ValueError` as `spectrum_to_rgb` does, and for another number of channels.
+    """
+    if wavelengths is None:
+        return picture
+    matrix, channels = spectrum_to_rgb(wavelengths, illuminant), picture.shape[-1]
+    check_values(_COUNT, len(matrix), f"{channels}, that of channels", lambda n: n == channels)
+    return picture @ matrix.astype(picture.dtype)
+
+
+def channel_names(channels: int, wavelengths: Numbers | None = None) -> list[str]:
+    """Name the channels of a picture in an EXR file: R, G and B, or by number; or by wavelength, as
+    Fichet, Pacanowski and Wilkie 2021 propose, in ascending order.
+    """
+    if wavelengths is None:
+        return list("RGB") if channels == 3 else [str(k) for k in range(1, channels + 1)]
+    names = [SPECTRAL + f"{node:.3f}nm".replace(".", ",") for node in np.asarray(wavelengths)]
+    check_values(_COUNT, len(names), f"{channels}, that of channels", lambda n: n == channels)
+    return names
+
+
+def _tables(wavelengths: Numbers, name: str) -> tuple[np.ndarray, ...]:
+    """Return the weight of each wavelength in a spectrum that is linear between them, on the grid;
+    the power of a light, of luminance 1; the observer, X, Y and Z; and their matrix to linear sRGB.
+    """
+    nodes = np.asarray(wavelengths, np.float64)
+    check_values("the steps of wavelengths", np.diff(nodes), "positive (nm)", lambda x: x > 0)
+    if not nodes.size or nodes[0] > _GRID[-1] or nodes[-1] < _GRID[0]:
+        raise ValueError(f"wavelengths {nodes.tolist()} must be nm that the eye sees, 380 to 780")
+    import colour  # takes two seconds
+
+    lights = {**colour.SDS_ILLUMINANTS, **colour.SDS_LIGHT_SOURCES}
+    if name not in lights:
+        raise ValueError(f"illuminant {name!r} is unknown; {nearest(name, lights)}")
+    observer, light = (
+        table.copy().align(colour.SpectralShape(*_GRID[[0, -1]], 1)).values
+        for table in (colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"], lights[name])
+    )
+    hats = np.asarray([np.interp(_GRID, nodes, hat) for hat in np.eye(len(nodes))])
+    power = light * observer[:, 1].sum() / (light @ observer[:, 1])
+    return hats, power, observer, colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB
