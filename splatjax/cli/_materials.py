@@ -256,13 +256,14 @@ class Sample:
                 )
             },
         )
-        excluded = {"mesh", "count", "output", "material", "second"}
+        excluded = {"mesh", "count", "output", "material", "second", "share"}
         options = {key: vars(self)[key] for key in vars(self).keys() - excluded}
         if self.second is not None:
             with jax.enable_x64(True):
-                options["factors"] = sj.fitting.weight_factors(
-                    *(sj.load_material(name).gaussians for name in (self.material, self.second))
-                )
+                own, other = (sj.load_material(n).gaussians for n in (self.material, self.second))
+                change = np.asarray(sj.fitting.weight_factors(own, other)) - 1
+            options["parameters"] = {"share": self.share}
+            options["weights"] = lambda values: 1 + values["share"][:, None, None] * change[None]
         with stage(f"sampling {self.mesh} with {self.count} splats"):
             splats = sj.sample_mesh(self.mesh, self.count, **options)
         with stage(f"writing {self.output}"):

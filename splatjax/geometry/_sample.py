@@ -1,6 +1,8 @@
 """Splats from a triangle mesh with textures, or from points without normals, radii or areas."""
 
 import warnings
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -25,8 +27,9 @@ class Textures(eqx.Module):
     - `roughness`: factor on the material's roughness.
     - `normal`: tangent-space normals in [-1, 1]: x along u, y along v (*up*), z outward; of any
       positive length.
-    - `share`: the fraction of the surface that consists of a second material, from 0 to 1, whose
-      weights are `factors` times those of the first.
+    - `parameters`: maps of parameters of the material, such as melanin, or one number for all.
+    - `weights`: computes `Splats.weights` from the parameters at the splats, by name: for instance
+      `factors` of a `splatjax.fitting.WeightTable`.
     """
 
     albedo: (
@@ -35,8 +38,10 @@ class Textures(eqx.Module):
     specular: Float[np.ndarray, "h2 w2"] | None = None
     roughness: Float[np.ndarray, "h3 w3"] | None = None
     normal: Float[np.ndarray, "h4 w4 3"] | None = None
-    share: Float[np.ndarray, "h5 w5"] | None = None
-    factors: Float[np.ndarray, "gaussians channels"] | float = 1.0
+    parameters: dict[str, Float[np.ndarray, "_ _"] | float] = eqx.field(
+        default_factory=dict, kw_only=True
+    )
+    weights: Callable[[dict[str, Any]], Any] | None = eqx.field(default=None, kw_only=True)
 
 
 def lookup_at(
@@ -156,15 +161,18 @@ def splats_at(
     areas, reaches, _ = surface_cells(centers, normals, images, limit=spacing)
     areas = areas * (area / areas.sum())
     radii = _radii(areas, reaches, images, spacing)
-    specular, roughness, share, tangent_space = (
+    specular, roughness, tangent_space = (
         lookup_at(mesh, points, getattr(textures, name))
-        for name in ("specular", "roughness", "share", "normal")
+        for name in ("specular", "roughness", "normal")
     )
-    weights = (
-        None
-        if share is None
-        else 1 + share[:, None, None] * (np.asarray(textures.factors) - 1)[None]
-    )
+    values: dict[str, Any] = {
+        # Rounding would lead beyond the values of the map.
+        name: np.clip(np.asarray(lookup_at(mesh, points, given)), given.min(), given.max())
+        if isinstance(given, np.ndarray)
+        else given
+        for name, given in textures.parameters.items()
+    }
+    weights = None if textures.weights is None else textures.weights(values)
     if tangent_space is not None:
         normals = perturbed_normals(mesh, points, normals, tangent_space)
     albedo = albedo_at(textures, mesh, points)

@@ -2,14 +2,15 @@
 they are checked once for all formats.
 """
 
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from splatjax._display import srgb_to_linear
 from splatjax._memory import check_memory
@@ -57,8 +58,8 @@ def sample_mesh(
     albedo: StrPath | None = None,
     specular: StrPath | None = None,
     normal: StrPath | None = None,
-    share: StrPath | None = None,
-    factors: Float[Array, "gaussians channels"] | None = None,
+    parameters: Mapping[str, StrPath | Float[np.ndarray, "_ _"] | float] | None = None,
+    weights: Callable[[dict[str, Any]], Any] | None = None,
     v_up: bool | None = None,
     up: str = "y",
     crop_min_y: float | None = None,
@@ -78,9 +79,10 @@ def sample_mesh(
       of the file, if any.
     - `specular`: gray picture, not decoded: factor on the material's specular strength.
     - `normal`: tangent-space normal map, not decoded; green points up.
-    - `share`, `factors`: gray picture, not decoded: the fraction of the surface that consists of a
-      second material, whose weights are `factors` times those of the first
-      (`splatjax.fitting.weight_factors`).
+    - `parameters`: parameters of the material by name, such as melanin: gray pictures, not decoded,
+      in which whole numbers count from 0 to 1; arrays of the same kind; or one number for all.
+    - `weights`: computes `Splats.weights` from the parameters at the splats, each an array, such as
+      `table.factors` of a `splatjax.fitting.weight_table`.
     - `v_up`: whether v = 0 is the *lower* edge of a map. `None` follows the format: true, except in
       glTF and GLB. If the texture appears upside down, give the opposite.
     - `up`: the file's upward axis, `"y"` or `"z"`; splats have +y up.
@@ -104,8 +106,8 @@ def sample_mesh(
         albedo=albedo,
         specular=specular,
         normal=normal,
-        share=share,
-        factors=factors,
+        parameters=parameters,
+        weights=weights,
         v_up=v_up,
         up=up,
         crop_min_y=crop_min_y,
@@ -122,8 +124,8 @@ def read_textured_mesh(
     albedo: StrPath | None = None,
     specular: StrPath | None = None,
     normal: StrPath | None = None,
-    share: StrPath | None = None,
-    factors: Float[Array, "gaussians channels"] | None = None,
+    parameters: Mapping[str, StrPath | Float[np.ndarray, "_ _"] | float] | None = None,
+    weights: Callable[[dict[str, Any]], Any] | None = None,
     v_up: bool | None = None,
     up: str = "y",
     crop_min_y: float | None = None,
@@ -147,15 +149,19 @@ def read_textured_mesh(
         albedo=_own_albedo(path, pieces) if albedo is None else read_color(albedo),
         specular=None if specular is None else read_map(specular) @ _LUMA,
         normal=None if normal is None else 2 * read_map(normal) - 1,
-        share=None if share is None else read_map(share) @ _LUMA,
-        factors=1.0 if factors is None else np.asarray(factors, float),
+        parameters={
+            name: read_map(given) @ _LUMA if isinstance(given, str | os.PathLike) else given
+            for name, given in (parameters or {}).items()
+        },
+        weights=weights,
     )
     require(
-        (share is None) == (factors is None),
+        (parameters is None) == (weights is None),
         path,
-        f"share is {share}, factors are {factors}; give both, or neither",
+        f"parameters are {', '.join(parameters or ['None'])}, weights {weights}; give both, or "
+        "neither",
     )
-    has_maps = any(name is not None for name in (albedo, specular, normal, share))
+    has_maps = any(name is not None for name in (albedo, specular, normal, parameters))
     require(
         not has_maps or (mesh.uvs is not None and not np.isnan(mesh.uvs).any()),
         path,

@@ -100,6 +100,7 @@ _MADE = {
     "points.ply": _points,
     "color.jpg": _map,
     "freckles.png": _map,
+    "melanin.png": _map,
     "albedo.jpg": _map,
     "shine.jpg": _map,
     "normals.jpg": _map,

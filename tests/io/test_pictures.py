@@ -249,3 +249,30 @@ def test_specular_and_normal_maps(folder):
     assert splats.albedo is None
     np.testing.assert_allclose(splats.specular, 0.2, rtol=1e-6)
     np.testing.assert_allclose(splats.normals, np.tile([0.6, 0, 0.8], (50, 1)), atol=2 / 255)
+
+
+def tanned(melanin, blood) -> sj.SumOfGaussians:
+    falls = np.asarray([[1.0, 2.0], [3.0, 2.0]]) * melanin + np.asarray([[5.0, 1.0]]) * blood
+    return sj.SumOfGaussians([0.3, 2.0], [[0.4, 0.3], [0.5, 0.6]] * np.exp(-falls))
+
+
+def test_weights_follow_maps_of_parameters(folder):
+    """Melanin that grows upwards, and one blood for all."""
+    nodes = {"melanin": np.geomspace(0.01, 0.4, 4), "blood": [0.01, 0.1]}
+    table = sj.fitting.weight_table(tanned, nodes, tanned(0.01, 0.01))
+    rising = 0.02 + 0.28 * (1 - (np.arange(64.0)[:, None] + 0.5) / 64) * np.ones(8)
+    path = write_picture(folder / "melanin.exr", rising[..., None], "float")
+
+    def weights(melanin, function=table.factors):
+        parameters = {"melanin": melanin, "blood": 0.05}
+        mesh, options = folder / "square.obj", {"parameters": parameters, "weights": function}
+        splats = sample_mesh(mesh, 60, mm_per_unit=5.0, **options)
+        return np.asarray(splats.centers)[:, 1] / 10, splats.weights
+
+    height, found = weights(path)
+    inner = np.abs(height - 0.5) < 0.49
+    expected = table.factors({"melanin": 0.02 + 0.28 * height[inner], "blood": 0.05})
+    np.testing.assert_allclose(found[inner], expected, rtol=1e-5)
+    np.testing.assert_allclose(weights(rising)[1], found, rtol=1e-5)
+    assert_refused(lambda: weights(5 * rising), "square.obj: melanin must be between 0.01 and 0.4")
+    assert_refused(lambda: weights(rising, None), "square.obj: .* give both")
