@@ -19,13 +19,14 @@ from splatjax.io import atomic_path
 
 def scene(mi, body: Body, mesh: Path, albedo=ALBEDO):
     """Describe a medium of isotropic scattering inside a boundary that is smooth, or, at index 1,
-    neither reflects nor bends; lights are not seen themselves.
+    neither reflects nor bends; lights are not seen themselves. The albedo is red, green and blue,
+    or the description of a volume.
     """
     transform = mi.ScalarTransform4f
     medium = {
         "type": "homogeneous",
         "sigma_t": SIGMA_T,
-        "albedo": {"type": "rgb", "value": list(albedo)},
+        "albedo": albedo if isinstance(albedo, dict) else {"type": "rgb", "value": list(albedo)},
         "phase": {"type": "isotropic"},
     }
     view = transform().look_at(origin=list(body.eye), target=list(body.target), up=[0, 1, 0])
@@ -86,13 +87,13 @@ def emitter(mi, light: sj.scene.AbstractLight) -> dict:
     }
 
 
-def trace(mi, body: Body, path: Path) -> None:
+def trace(mi, body: Body, path: Path, albedo=ALBEDO) -> None:
     """Write the sums of the passes and of their squares. What a smooth boundary reflects, and the
     light that passes unscattered, are traced in a black medium and subtracted.
     """
     mesh = path.with_suffix(".ply")
     body.shape().export(mesh)
-    described, total, squares, seconds = scene(mi, body, mesh), 0.0, 0.0, np.inf
+    described, total, squares, seconds = scene(mi, body, mesh, albedo), 0.0, 0.0, np.inf
     black = scene(mi, body, mesh, (0.0, 0.0, 0.0))
     passes = PASSES if body.eta == 1 else 4 * PASSES  # without connections to the lights
     for number in track(range(passes), description=body.name):
