@@ -211,7 +211,8 @@ class EscapeNormalization(AbstractDiffusionKernel):
         # The decay rate in units of the layer's width, kappa sqrt(v), and its square.
         variance = variances.reshape(*variances.shape, *[1] * (energies.ndim - variances.ndim))
         mean_variance = jnp.sum(energies * variance, axis=0) / jnp.maximum(leaves, _TINY_ENERGY)
-        squared_rate = absorbed / jnp.where(mean_variance > 0, mean_variance, 1.0)
+        diffuses = jnp.sum(energies, axis=0) > _TINY_ENERGY
+        squared_rate = absorbed / jnp.where(diffuses, mean_variance, 1.0)
         squared = squared_rate[None] * variance
         decay = jnp.sqrt(jnp.maximum(squared, _TINY_ENERGY))
 

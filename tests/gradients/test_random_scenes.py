@@ -305,6 +305,7 @@ DEGENERATE = {
     "splats smaller than anything": {"scene.splats.radii": 1e-6},
     "a splat larger than the picture": {"scene.splats.radii": 40.0},
     "no weight": {"scene.material.gaussians.weights": 0.0},
+    "hardly any weight": {"scene.material.gaussians.weights": 1e-36},
     "white": {"scene.material.gaussians.weights": 1.0},
     "equal indices": {"scene.material.eta": 1.0},
     "mirror": {"scene.material.roughness": 0.0},
