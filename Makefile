@@ -65,10 +65,11 @@ test-long: setup
 	JAX_ENABLE_X64=1 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" \
 	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -m long
 
-# Ten thousand scenes and losses, in both precisions: no gradient of a finite loss may be infinite or no number.
+# Ten thousand scenes and losses, in both precisions: no gradient of a finite loss may be infinite or no number. And five hundred
+# bodies of every kind: the fast rasterizer is the plain one.
 random-scenes: setup
 	SPLATJAX_RANDOM_SCENES=10000 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" \
-	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -q tests/gradients/test_random_scenes.py
+	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -q tests/gradients/test_random_scenes.py tests/splatting/test_rasterizers.py
 
 # Twenty thousand spoiled files for every reader; those that fail are added to tests/io/corpus. `tools/fuzz.py` has files that
 # grow along new lines of code, by atheris.
