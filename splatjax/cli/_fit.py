@@ -234,12 +234,12 @@ class Fit:
                 check_unused(self, names, f"{self.medium} is read as {kind}, not as {intended}")
         if kind == _COEFFICIENTS:
             coefficients = sj.load_profile(self.medium)
-            # A dipole depends only on the reduced coefficients.
             needs_g = self.g is not None or self.model not in ("dipole", "better-dipole")
             g = self._mean_cosine() if needs_g else 0.0
+            is_rgb = "wavelengths" not in sj.io.surface_and_source(self.medium)[0]
             with sj.io.naming(self.medium):
                 return coefficients, _models.reference(
-                    coefficients, self.model, self.photons, g, self.single_scattering
+                    coefficients, self.model, self.photons, g, self.single_scattering, is_rgb
                 )
         if kind == _PROFILE:
             measured = sj.io.read_profile(self.medium, mm_per_unit=self.mm_per_unit)

@@ -62,6 +62,7 @@ def reference(
     photons: int,
     g: float,
     single_scattering: bool,
+    is_rgb: bool = True,
 ) -> Reference:
     """Return the profile of a medium or of layers by a model.
 
@@ -71,6 +72,7 @@ def reference(
       layers.
     - `g`: mean cosine of the phase function.
     - `single_scattering`: whether light that scatters once is separated from the profile.
+    - `is_rgb`: whether the wavelengths of a skin become linear sRGB, under daylight.
 
     **Raises:** `ValueError` for options that the model, or a material with layers, does not
     support.
@@ -84,9 +86,9 @@ def reference(
             )
         if is_burley:
             return Reference(coefficients, sj.fitting.TransportModel.rule)
-        # In linear sRGB, under daylight.
-        skin = sj.fitting.SkinModel(sj.io.spectrum_to_rgb(coefficients.wavelengths))
-        return _by_model(skin, coefficients)
+        nodes = coefficients.wavelengths
+        matrix = sj.io.spectrum_to_rgb(nodes) if is_rgb else np.eye(len(nodes))
+        return _by_model(sj.fitting.SkinModel(matrix), coefficients)
     is_layered = isinstance(coefficients, sj.LayeredMultipole)
     model = model or ("dipole" if is_layered else "photon-beam")
     option = f"--model {model}{' with --single-scattering' if single_scattering else ''}"

@@ -142,7 +142,7 @@ class ViewOptions:
             ),
         }
         check_options(self, rules | (more_rules or {}))
-        # Of an unknown illuminant, an error.
+        # Raise an error for an unknown illuminant.
         sj.io.picture_to_rgb(np.zeros(material.channels), material.wavelengths, self.illuminant)
         _ = self._environment  # its file is read before anything is made
         count = 0 if self.splats else self.count

@@ -38,9 +38,7 @@ class Textures(eqx.Module):
     specular: Float[np.ndarray, "h2 w2"] | None = None
     roughness: Float[np.ndarray, "h3 w3"] | None = None
     normal: Float[np.ndarray, "h4 w4 3"] | None = None
-    parameters: dict[str, Float[np.ndarray, "_ _"] | float] = eqx.field(
-        default_factory=dict, kw_only=True
-    )
+    parameters: dict[str, Any] = eqx.field(default_factory=dict, kw_only=True)
     weights: Callable[[dict[str, Any]], Any] | None = eqx.field(default=None, kw_only=True)
 
 
@@ -165,13 +163,17 @@ def splats_at(
         lookup_at(mesh, points, getattr(textures, name))
         for name in ("specular", "roughness", "normal")
     )
-    values: dict[str, Any] = {
+
+    def at_points(name: str, given: Any) -> Float[np.ndarray, " n"]:
+        given = np.asarray(given, np.float64)
+        if given.ndim not in (0, 2):
+            raise ValueError(f"{name} has shape {given.shape}; give a gray map, or one number")
+        if not given.ndim:
+            return np.full(len(centers), given)
         # Rounding would lead beyond the values of the map.
-        name: np.clip(np.asarray(lookup_at(mesh, points, given)), given.min(), given.max())
-        if isinstance(given, np.ndarray)
-        else given
-        for name, given in textures.parameters.items()
-    }
+        return np.clip(np.asarray(lookup_at(mesh, points, given)), given.min(), given.max())
+
+    values = {name: at_points(name, given) for name, given in textures.parameters.items()}
     weights = None if textures.weights is None else textures.weights(values)
     if tangent_space is not None:
         normals = perturbed_normals(mesh, points, normals, tangent_space)

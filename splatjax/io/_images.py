@@ -131,6 +131,8 @@ def write_png(
     check_suffix(path, ".png")
     values = picture.beauty if isinstance(picture, Frame) else picture
     with naming(path):
+        if isinstance(picture, Frame) and values.shape[-1] == 4 and wavelengths is None:
+            raise ValueError("a frame of 4 channels has no alpha; give their wavelengths")
         rgb = picture_to_rgb(np.asarray(values), wavelengths, illuminant)
         content = png_of(to_display(rgb, exposure))
     with atomic_path(path) as temporary:

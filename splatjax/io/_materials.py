@@ -245,9 +245,8 @@ def plain_material(
     elif (medium := material.medium if profile is None else profile.medium) is not None:
         tables["medium"] = plain_medium(medium) | ({"g": g} if g else {})
     if (single := material.single_scattering) is not None:
-        tables["single_scattering"] = plain_medium(single.medium) | plain_record(
-            single, medium=None
-        )
+        own = plain_record(single, medium=None)
+        tables["single_scattering"] = plain_medium(single.medium) | own
     if material.angles is not None:
         tables["angles"] = plain_record(material.angles)
     if material.wavelengths is not None:
@@ -292,9 +291,8 @@ def _read(
     path, entries, profile = tables.path, tables.entries, None
     kinds = [KINDS[kind] for kind in KINDS if kind in entries]
     require(len(kinds) < 2, path, f"has {' and '.join(kinds)}; give one of them")
-    require(
-        kinds or "fit" in entries, path, f"has no {', '.join(KINDS.values())} or [fit]; give one"
-    )
+    missing = f"has no {', '.join(KINDS.values())} or [fit]; give one"
+    require(kinds or "fit" in entries, path, missing)
     entries.setdefault("surface", {})
     table = tables.table("surface", _SURFACE)
     if "openpbr" in entries:
@@ -317,6 +315,8 @@ def _read(
             profile = LayeredMultipole(layers)
     if "wavelengths" in entries:
         surface["wavelengths"] = nodes = tables.numbers("wavelengths")
+        own = profile.wavelengths if isinstance(profile, Skin) else nodes
+        require(np.array_equal(own, nodes), path, f"has other wavelengths than its [skin]: {own}")
         channels = profile.medium.channels if isinstance(profile, Dipole) else nodes.size
         tables.make(Material, SumOfGaussians([1.0], [[1.0] * channels]), wavelengths=nodes)
     return tables, surface, profile

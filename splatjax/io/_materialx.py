@@ -54,9 +54,10 @@ def save_materialx(
 
 
 def check_colors(path: StrPath, material: Material) -> None:
-    """Raise `ValueError` for a material that has neither one nor three channels."""
-    fault = f"the material has {material.channels} channels; give one of 1 or 3"
-    require(material.channels in (1, 3), path, fault)
+    """Raise `ValueError` for a material that is neither gray nor red, green and blue."""
+    is_rgb = material.channels in (1, 3) and material.wavelengths is None
+    kind = "channels" if material.wavelengths is None else "wavelengths"
+    require(is_rgb, path, f"the material has {material.channels} {kind}; give gray or RGB")
 
 
 def openpbr_inputs(

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from splatjax._display import srgb_to_linear
 from splatjax._memory import check_memory
+from splatjax._records import Numbers
 from splatjax.geometry import (
     Mesh,
     Textures,
@@ -58,7 +59,7 @@ def sample_mesh(
     albedo: StrPath | None = None,
     specular: StrPath | None = None,
     normal: StrPath | None = None,
-    parameters: Mapping[str, StrPath | Float[np.ndarray, "_ _"] | float] | None = None,
+    parameters: Mapping[str, StrPath | Numbers] | None = None,
     weights: Callable[[dict[str, Any]], Any] | None = None,
     v_up: bool | None = None,
     up: str = "y",
@@ -80,7 +81,7 @@ def sample_mesh(
     - `specular`: gray picture, not decoded: factor on the material's specular strength.
     - `normal`: tangent-space normal map, not decoded; green points up.
     - `parameters`: parameters of the material by name, such as melanin: gray pictures, not decoded,
-      in which whole numbers count from 0 to 1; arrays of the same kind; or one number for all.
+      in which whole numbers count from 0 to 1; arrays (height, width); or one number for all.
     - `weights`: computes `Splats.weights` from the parameters at the splats, each an array, such as
       `table.factors` of a `splatjax.fitting.weight_table`.
     - `v_up`: whether v = 0 is the *lower* edge of a map. `None` follows the format: true, except in
@@ -124,7 +125,7 @@ def read_textured_mesh(
     albedo: StrPath | None = None,
     specular: StrPath | None = None,
     normal: StrPath | None = None,
-    parameters: Mapping[str, StrPath | Float[np.ndarray, "_ _"] | float] | None = None,
+    parameters: Mapping[str, StrPath | Numbers] | None = None,
     weights: Callable[[dict[str, Any]], Any] | None = None,
     v_up: bool | None = None,
     up: str = "y",
@@ -161,7 +162,8 @@ def read_textured_mesh(
         f"parameters are {', '.join(parameters or ['None'])}, weights {weights}; give both, or "
         "neither",
     )
-    has_maps = any(name is not None for name in (albedo, specular, normal, parameters))
+    has_maps = any(name is not None for name in (albedo, specular, normal))
+    has_maps = has_maps or any(np.ndim(given) for given in textures.parameters.values())
     require(
         not has_maps or (mesh.uvs is not None and not np.isnan(mesh.uvs).any()),
         path,

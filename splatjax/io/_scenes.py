@@ -74,6 +74,12 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
     else:
         material = file.make(load_material, source)
         material = material if splats.albedo is None else material.white()
+    require(
+        material.wavelengths is None or splats.albedo is None,
+        path,
+        "has a material of wavelengths, and splats with albedo in red, green and blue; give "
+        "`albedo = false` in [splats]",
+    )
     lights = [
         light_of(light, material.channels, material.wavelengths is not None)
         for light in file.tables("lights", LIGHT_ENTRIES)
@@ -172,6 +178,11 @@ def save_scene(
         image = path.with_name(f"{path.stem}_{number}.exr")
         lights.append(plain_light(light, image.name))
         if isinstance(light, EnvironmentLight):
+            require(
+                scene.material.wavelengths is None or light.image.shape[-1] == 1,
+                path,
+                "cannot store an environment of wavelengths; give a gray image, of one channel",
+            )
             write_image(image, light.image)
     write_splats(path.with_suffix(".ply"), scene.splats)
     splats = {"file": path.with_suffix(".ply").name}

@@ -9,8 +9,8 @@ from splatjax._records import Numbers, check_values
 
 from ._tables import nearest
 
-SPECTRAL = "S0."  # begin of the names of channels of wavelengths: the first Stokes component
-_COUNT = "the number of wavelengths"
+SPECTRAL = "S0."  # prefix of the names of channels that are wavelengths: the first Stokes component
+_COUNT, _STEPS = "the number of wavelengths", "the steps of wavelengths"
 _GRID = np.arange(380.0, 781.0)  # nm
 
 
@@ -85,7 +85,9 @@ def channel_names(channels: int, wavelengths: Numbers | None = None) -> list[str
     """
     if wavelengths is None:
         return list("RGB") if channels == 3 else [str(k) for k in range(1, channels + 1)]
-    names = [SPECTRAL + f"{node:.3f}nm".replace(".", ",") for node in np.asarray(wavelengths)]
+    nodes = np.asarray(wavelengths)
+    check_values(_STEPS, np.diff(nodes), "at least 0.001 (nm)", lambda x: x >= 1e-3)
+    names = [SPECTRAL + f"{node:.3f}nm".replace(".", ",") for node in nodes]
     check_values(_COUNT, len(names), f"{channels}, that of channels", lambda n: n == channels)
     return names
 
@@ -95,7 +97,7 @@ def _tables(wavelengths: Numbers, name: str) -> tuple[np.ndarray, ...]:
     the power of a light, of luminance 1; the observer, X, Y and Z; and their matrix to linear sRGB.
     """
     nodes = np.asarray(wavelengths, np.float64)
-    check_values("the steps of wavelengths", np.diff(nodes), "positive (nm)", lambda x: x > 0)
+    check_values(_STEPS, np.diff(nodes), "positive (nm)", lambda x: x > 0)
     if not nodes.size or nodes[0] > _GRID[-1] or nodes[-1] < _GRID[0]:
         raise ValueError(f"wavelengths {nodes.tolist()} must be nm that the eye sees, 380 to 780")
     import colour  # takes two seconds

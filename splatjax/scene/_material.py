@@ -32,7 +32,7 @@ class Material(eqx.Module):
         material = Material.of_medium(Medium([0.02, 0.006, 0.015], [1.1, 1.3, 1.5], eta=1.6))
         material = Material(fit_gaussians(Dipole(load_medium("marble"))).gaussians, eta=1.5)
 
-    **Attributes:** (all differentiable)
+    **Attributes:** (differentiable, but for `wavelengths`)
 
     - `gaussians`: the diffusion profile. The sum of its weights is the diffuse reflectance.
     - `eta`: index of refraction relative to air, positive. It determines how much light the surface

@@ -274,5 +274,13 @@ def test_weights_follow_maps_of_parameters(folder):
     expected = table.factors({"melanin": 0.02 + 0.28 * height[inner], "blood": 0.05})
     np.testing.assert_allclose(found[inner], expected, rtol=1e-5)
     np.testing.assert_allclose(weights(rising)[1], found, rtol=1e-5)
+    whole = (100 * rising).astype(np.uint8)  # looked up between its numbers, as others are
+    hundredths = weights(
+        whole, lambda values: table.factors(values | {"melanin": 0.01 * values["melanin"]})
+    )
+    np.testing.assert_allclose(hundredths[1], weights(whole * 0.01)[1], rtol=1e-5)
+    one = table.factors({"melanin": np.full(60, 0.1), "blood": 0.05})
+    np.testing.assert_allclose(weights(np.asarray(0.1))[1], one, rtol=1e-6)
+    assert_refused(lambda: weights(np.ones((4, 4, 3))), r"melanin has shape \(4, 4, 3\)")
     assert_refused(lambda: weights(5 * rising), "square.obj: melanin must be between 0.01 and 0.4")
     assert_refused(lambda: weights(rising, None), "square.obj: .* give both")

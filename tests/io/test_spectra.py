@@ -188,6 +188,10 @@ def test_spectral_layers_come_back_and_are_read_by_colour_science(patch, tmp_pat
     np.testing.assert_array_equal(picture, frame.beauty)
     assert_refused(lambda: sj.write_exr(path, frame, wavelengths=[500, 600]), "must be 31")
     assert_refused(lambda: sj.write_png(tmp_path / "a.png", frame), "31 channels")
+    descending = WAVELENGTHS[::-1]
+    assert_refused(
+        lambda: sj.write_exr(path, frame, wavelengths=descending), "steps of wavelengths"
+    )
     assert_refused(
         lambda: sj.write_png(tmp_path / "a.png", frame, wavelengths=[500, 600]), "must be 31"
     )
@@ -211,6 +215,13 @@ def test_a_material_keeps_its_wavelengths(tmp_path):
     medium = '[medium]\nunit = "1/mm"\nsigma_a = [0.1, 0.2]\nsigma_s_prime = 1.0\neta = 1.3\n'
     stone.write_text(f"wavelengths = [450, 550, 650]\n{medium}")
     assert_refused(lambda: sj.load_medium(stone), r"stone.toml.*wavelengths has shape \[3\]")
+    stone.write_text("wavelengths = [450, 550]\n[skin]\nwavelengths = [450, 560]\n")
+    assert_refused(lambda: sj.load_profile(stone), "stone.toml.*other wavelengths than its")
+    exported = tmp_path / "five.mtlx"
+    blue_first = sj.Material(
+        sj.SumOfGaussians([1.0], [[0.1, 0.2, 0.3]]), wavelengths=[450, 550, 650]
+    )
+    assert_refused(lambda: sj.io.save_materialx(exported, blue_first), "3 wavelengths; give gray")
 
 
 def test_pigments_to_weights_are_one_program():
