@@ -47,6 +47,7 @@ def test_a_picture_is_that_of_render(studio, states, name):
     assert draft.mean() == pytest.approx(picture.mean(), rel=COARSE)
 
 
+@pytest.mark.long
 def test_the_whole_picture_has_the_settings(studio, another, states):
     controls, settings = states["absorption"], sj.RenderSettings(diffuser=ShapeDiffuser())
     session = another(settings)
@@ -177,6 +178,7 @@ def test_pigments_change_skin_as_a_fit_does(skin_studio, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.once
+@pytest.mark.long
 def test_wavelengths_are_shown_in_color(another):
     nodes = [450.0, 530.0, 600.0, 650.0]
     gaussians = sj.SumOfGaussians([0.5, 2.0], [[0.05, 0.1, 0.2, 0.2], [0.05, 0.1, 0.3, 0.4]])
