@@ -85,9 +85,12 @@ FROM_HEAD = (250, 100, 800), (0, 70, 0), 19, 683_549
 BUST, FROM_BUST = "the built-in bust", ((250, 0, 800), (0, -40, 0), 22, 300_000)
 EAR = (450, 80, 300), (60, 60, 0), 9, 683_549
 STUDIO = sj.EnvironmentLight(sj.scene.studio())
+LIKE_KEY = "lit like the studio's large softbox"
+KEY = lamp(0.41, -0.574, -0.709)  # from the studio's large softbox
 BEHIND = sj.EnvironmentLight(np.roll(sj.scene.studio(), len(sj.scene.studio()), axis=1))
 BODIES = [
     Body("sphere", f"{SPHERE}, lit from the side", sphere, lamp(-1, -1, -1), *FROM_SPHERE),
+    Body("sphere_key", f"{SPHERE}, {LIKE_KEY}", sphere, KEY, *FROM_SPHERE),
     Body("sphere_studio", f"{SPHERE} in the studio", sphere, STUDIO, *FROM_SPHERE),
     Body(
         "sphere_refracting",
@@ -152,6 +155,7 @@ BODIES = [
         eta=1.4,
     ),
     Body("head", f"{HEAD}, lit from the front", head, lamp(-0.7, -0.5, -1), *FROM_HEAD),
+    Body("head_key", f"{HEAD}, {LIKE_KEY}", head, KEY, *FROM_HEAD),
     Body("head_studio", f"{HEAD} in the studio", head, STUDIO, *FROM_HEAD),
     Body("head_refracting", f"{HEAD} in the studio, eta 1.4", head, STUDIO, *FROM_HEAD, eta=1.4),
     Body(
@@ -165,7 +169,7 @@ BODIES = [
     *(
         Body(f"bust_{name}", f"{BUST}, lit like the studio's {what}", bust, light, *FROM_BUST)
         for name, what, light in (
-            ("key", "large softbox", lamp(0.41, -0.574, -0.709)),
+            ("key", "large softbox", KEY),
             ("fill", "weak softbox", lamp(-0.962, -0.087, -0.258)),
             ("rim", "strip behind", lamp(-0.453, -0.423, 0.785)),
         )
@@ -191,7 +195,7 @@ BODIES = [
 
 # A frame of the solved head takes one to two minutes.
 UNSOLVED = (
-    *("head_studio", "head_refracting", "head_softbox"),
+    *("head_key", "head_studio", "head_refracting", "head_softbox"),
     *("bust", "bust_key", "bust_fill", "bust_rim", "bust_studio", "bust_softbox"),
     "ear_refracting",
 )
