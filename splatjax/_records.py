@@ -31,8 +31,8 @@ from jaxtyping import Array, DTypeLike
 
 Class = TypeVar("Class", bound=type)
 Item = TypeVar("Item")
+# Numbers, lists, tuples and arrays: everything that can be read as an array.
 Numbers: TypeAlias = ArrayLike | Sequence[Any] | jax.ShapeDtypeStruct
-"""Numbers, lists, tuples and arrays: everything that can be read as an array."""
 
 
 def numbers(values: Numbers | None) -> Any:
@@ -116,18 +116,27 @@ def record(cls: Class) -> Class:
     return cls
 
 
+def require(holds: Any, message: str) -> None:
+    """Raise `ValueError` with a message unless a condition holds."""
+    if not holds:
+        raise ValueError(message)
+
+
 def check_class(name: str, value: Any, *kinds: type) -> None:
     """Raise `ValueError` for a value that is no record of one of some classes."""
     if not isinstance(value, kinds):
-        expected = " or ".join(_call(kind) for kind in kinds)
-        raise ValueError(f"{name} must be {expected}; got {type(value).__name__}")
+        raise ValueError(
+            f"{name} must be {' or '.join(map(_call, kinds))}; got {type(value).__name__}"
+        )
 
 
 def check_installed(use: str, module: str, package: str | None = None) -> None:
     """Raise `ValueError` if an optional package is missing; the message names what needs it."""
-    if importlib.util.find_spec(module) is None:
-        package = package or module
-        raise ValueError(f"{use} needs {package}; install it: pip install {package}")
+    package = package or module
+    require(
+        importlib.util.find_spec(module) is not None,
+        f"{use} needs {package}; install it: pip install {package}",
+    )
 
 
 def _call(cls: type) -> str:
