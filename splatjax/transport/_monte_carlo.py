@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from splatjax._records import Numbers, as_floats, check_values, is_traced
+from splatjax._records import Numbers, as_floats, check_values, is_traced, require
 from splatjax.scattering import Film, Layer, check_stack
 
 from ._results import MonteCarlo, assemble
@@ -21,35 +21,6 @@ _MOST_LANES, _LEAST_LANES, _PHOTONS_A_LANE = 16384, 1024, 8
 
 # In free paths of the first scattering layer: so thin that light does not move sideways in a film.
 _FILM_THICKNESS = 1e-6
-
-
-def _lay_out(
-    layers: Sequence[Layer | Film],
-    g: Float[Array, " layers"],
-    eta_above: Float[Array, "*channels"],
-    eta_below: Float[Array, "*channels"],
-) -> LayeredMedia:
-    """Convert layers, from the top. A film has the index of the next scattering layer below it,
-    or else of the last one above.
-    """
-    scattering = [layer for layer in layers if isinstance(layer, Layer)]
-    like = scattering[0].medium.sigma_a
-    thin = _FILM_THICKNESS / jax.lax.stop_gradient(scattering[0].medium.sigma_s_prime)
-    rows = []
-    for number, layer in enumerate(layers):
-        lower = [candidate for candidate in layers[number:] if isinstance(candidate, Layer)]
-        medium = (lower or scattering[-1:])[0].medium
-        if isinstance(layer, Film):
-            rows.append((layer.optical_depth / thin, jnp.zeros_like(like), thin, medium.eta))
-        else:
-            sigma_s = medium.sigma_s_prime / (1 - g[number])
-            thickness = jnp.broadcast_to(layer.thickness, like.shape)
-            rows.append((medium.sigma_a, sigma_s, thickness, medium.eta))
-    sigma_a, sigma_s, thickness, eta = (jnp.stack(column) for column in zip(*rows, strict=True))
-    above, below = (jnp.broadcast_to(edge, (1, len(like))) for edge in (eta_above, eta_below))
-    first = next(number for number, layer in enumerate(layers) if isinstance(layer, Layer))
-    eta = jnp.concatenate([above, eta, below])
-    return LayeredMedia(sigma_a, sigma_s, thickness, eta, g, first)
 
 
 def _shared_walks(media: LayeredMedia) -> list[np.ndarray]:
@@ -129,12 +100,12 @@ def monte_carlo(
     dtype = next(layer.medium.sigma_a.dtype for layer in layers if isinstance(layer, Layer))
     above, below, g = (as_floats(values, dtype) for values in (eta_above, eta_below, g))
     check_values("g", g, "between -1 and 1, both excluded", lambda x: abs(x) < 1)
-    if g.shape not in ((), (len(layers),)):
-        raise ValueError(
-            f"g must be one number, or one for each of the {len(layers)} layers; got {g.shape[0]}"
-        )
-    edges = None if edges is None else as_floats(edges, dtype)
-    media, edges = _prepare(layers, g, above, below, edges)
+    require(
+        g.shape in ((), (len(layers),)),
+        f"g must be one number, or one for each of the {len(layers)} layers; got {g.size}",
+    )
+    media, rings = _lay_out(layers, g, above, below)
+    edges = rings if edges is None else as_floats(edges, dtype)
     check_values("the number of edges", len(edges), "at least 2", lambda x: x > 1)
     check_values("edges", edges, "at least 0 (mm)", lambda x: x >= 0)
     check_values(
@@ -159,22 +130,43 @@ def monte_carlo(
         )
         means.append(_mean_moments(walk, progress=report))
     order = jnp.asarray(np.argsort(np.concatenate(groups)).astype(np.int32))
-    specular = incidence.reflected(media.eta[1] / media.eta[0])
-    return assemble(jnp.concatenate(means)[order], edges, settings["photons"], specular)
+    return assemble(
+        jnp.concatenate(means)[order],
+        edges,
+        settings["photons"],
+        incidence.reflected(media.eta[1] / media.eta[0]),
+    )
 
 
 @eqx.filter_jit
-def _prepare(layers, g, eta_above, eta_below, edges):
-    """Lay out the media, and, unless there are others, rings as far as light leaves."""
-    media = _lay_out(layers, jnp.broadcast_to(g, len(layers)), eta_above, eta_below)
-    if edges is not None:
-        return media, edges
-    top = jax.lax.stop_gradient(layers[media.first].medium)
+def _lay_out(layers, g, eta_above, eta_below):
+    """Convert layers, from the top. A film has the index of the next scattering layer below it,
+    or else of the last one above. Also return rings as far as light leaves.
+    """
+    scattering = [layer for layer in layers if isinstance(layer, Layer)]
+    top, g = jax.lax.stop_gradient(scattering[0].medium), jnp.broadcast_to(g, len(layers))
+    thin, none = _FILM_THICKNESS / top.sigma_s_prime, jnp.zeros_like(top.sigma_a)
+    rows = []
+    for number, layer in enumerate(layers):
+        lower = [candidate for candidate in layers[number:] if isinstance(candidate, Layer)]
+        medium = (lower or scattering[-1:])[0].medium
+        if isinstance(layer, Film):
+            rows.append((layer.optical_depth / thin, none, thin, medium.eta))
+        else:
+            sigma_s = medium.sigma_s_prime / (1 - g[number])
+            thickness = jnp.broadcast_to(layer.thickness, none.shape)
+            rows.append((medium.sigma_a, sigma_s, thickness, medium.eta))
+    sigma_a, sigma_s, thickness, eta = (jnp.stack(column) for column in zip(*rows, strict=True))
+    above, below = (jnp.broadcast_to(edge, none.shape)[None] for edge in (eta_above, eta_below))
+    first = [isinstance(layer, Layer) for layer in layers].index(True)
+    eta = jnp.concatenate([above, eta, below])
+    media = LayeredMedia(sigma_a, sigma_s, thickness, eta, g, first)
+
     free_path = 1 / top.sigma_t_prime
     fallen = 20 / jnp.maximum(jnp.sqrt(top.squared_sigma_tr), 1e-6 / free_path) + 10 * free_path
-    first, last = 0.02 * jnp.min(free_path), jnp.max(jnp.minimum(200 * free_path, fallen))
-    growing = first * (last / first) ** jnp.linspace(0, 1, 128, dtype=first.dtype)
-    return media, jnp.concatenate([jnp.zeros(1, first.dtype), growing])
+    inner, outer = 0.02 * jnp.min(free_path), jnp.max(jnp.minimum(200 * free_path, fallen))
+    growing = inner * (outer / inner) ** jnp.linspace(0, 1, 128, dtype=inner.dtype)
+    return media, jnp.concatenate([jnp.zeros(1, inner.dtype), growing])
 
 
 @eqx.filter_custom_jvp
@@ -192,12 +184,12 @@ def _mean_moments_jvp(primals, tangents, *, progress):
         ("eta", media_dot.eta),
         ("edges and g", (media_dot.g, walk_dot.edges, walk_dot.incidence)),
     ):
-        if jax.tree.leaves(tangent):
-            raise ValueError(
-                f"monte_carlo has no derivative in {name}, which changes the paths of photons; "
-                "differentiate sigma_a and sigma_s_prime, or take differences of results with "
-                "the same key"
-            )
+        require(
+            not jax.tree.leaves(tangent),
+            f"monte_carlo has no derivative in {name}, which changes the paths of photons; "
+            "differentiate sigma_a and sigma_s_prime, or take differences of results with the "
+            "same key",
+        )
     moments = finish(walk, True, progress)
     none = jnp.zeros_like(media.sigma_a)
     along = [none if dot is None else dot for dot in (media_dot.sigma_a, media_dot.sigma_s)]

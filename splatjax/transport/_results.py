@@ -26,24 +26,15 @@ class Sum(eqx.Module):
     high: Float[Array, "..."]
     low: Float[Array, "..."]
 
-    @classmethod
-    def zeros(cls, shape: tuple[int, ...], dtype) -> "Sum":
-        return cls(jnp.zeros(shape, dtype), jnp.zeros(shape, dtype))
-
     def plus(self, term: Float[Array, "..."]) -> "Sum":
         high = self.high + term
-        lost = jnp.where(
+        low = self.low + jnp.where(
             jnp.abs(self.high) >= jnp.abs(term),
             (self.high - high) + term,
             (term - high) + self.high,
         )
-        low = self.low + lost
         rounded = high + low
         return Sum(rounded, low - (rounded - high))
-
-    def over(self, count) -> Float[Array, "..."]:
-        """Compute the mean."""
-        return self.high / count + self.low / count
 
 
 def total(
@@ -88,9 +79,7 @@ def photon_moments(
         ring = jnp.where((ring < 0) | (ring >= rings), rings, ring)
         ring = jnp.where(photons.place == BELOW, ring + rings + 1, ring)
         ring = jnp.where(photons.place == INSIDE, 2 * rings + 2, ring)
-        counts = (done & ~dropped).astype(carried.dtype)
-        moments = _moments(carried, slope)
-        moments = moments * jnp.broadcast_to(counts[:, None], moments.shape)
+        moments = jnp.where((done & ~dropped)[:, None], _moments(carried, slope), 0.0)
         sums = jnp.zeros((_TABLES, 2 * rings + 3, moments.shape[1]), carried.dtype)
         return jnp.sum(sums.at[table, ring].add(moments), axis=0)
 

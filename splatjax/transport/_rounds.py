@@ -93,7 +93,8 @@ def finish(
             if progress is not None:
                 under_way = int(np.sum(np.asarray(state.photons.place) == INSIDE))
                 progress(int(state.started) - under_way)
-    return state.tally.over(walk.photons.astype(walk.edges.dtype))
+    photons = walk.photons.astype(walk.edges.dtype)
+    return state.tally.high / photons + state.tally.low / photons
 
 
 @eqx.filter_jit
@@ -106,8 +107,8 @@ def _start(walk: Walk, with_slopes: bool) -> _State:
         jnp.zeros((channels, walk.lanes), dtype), jnp.zeros((layers, channels, walk.lanes), dtype)
     )
     slopes = jax.tree.map(lambda leaf: jnp.zeros((parameters, *leaf.shape), dtype), weights)
-    tally = Sum.zeros((channels, 2 * rings + 3 + layers, 2 + parameters), dtype)
-    state = _State(photons, weights, slopes, tally, number[0], number[0])
+    nothing = jnp.zeros((channels, 2 * rings + 3 + layers, 2 + parameters), dtype)
+    state = _State(photons, weights, slopes, Sum(nothing, nothing), number[0], number[0])
     return _launch(walk, state, photons.place == IDLE)
 
 
@@ -163,8 +164,7 @@ def _round(walk: Walk, state: _State) -> _State:
         | dropped
         | (inside & (photons.flights >= walk.flights))
     )
-    ended = photon_moments(photons, weights, slopes, done, dropped, walk.edges)
-    tally = state.tally.plus(ended)
+    tally = state.tally.plus(photon_moments(photons, weights, slopes, done, dropped, walk.edges))
     after = _State(photons, weights, slopes, tally, state.started, state.round + 1)
     return _launch(walk, after, done | (photons.place == IDLE))
 
@@ -179,18 +179,25 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
     direction, weight = walk.incidence.enter(spread, xi[1], walk.media.eta[:2, 0])
 
     zero, number = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
-    place = jnp.where(begins, INSIDE, IDLE)
-    fresh = Photons(zero, zero, zero, direction, -jnp.log(xi[2]), number, place, number)
+    fresh = Photons(
+        zero,
+        zero,
+        zero,
+        direction,
+        to_scatter=-jnp.log(xi[2]),
+        layer=number,
+        place=jnp.where(begins, INSIDE, IDLE),
+        flights=number,
+    )
     photons = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, state.photons)
     weights, slopes = (
         jax.tree.map(lambda leaf: jnp.where(jnp.broadcast_to(free, leaf.shape), 0.0, leaf), part)
         for part in (state.weights, state.slopes)
     )
-    started_weight = jnp.broadcast_to(jnp.where(begins, weight, zero), weights.carried.shape)
-    weights = PathWeights(weights.carried + started_weight, weights.absorbed)
+    carried = weights.carried + jnp.where(begins, weight, zero)[None]
     return _State(
         photons,
-        weights,
+        PathWeights(carried, weights.absorbed),
         slopes,
         state.tally,
         started=state.started + jnp.sum(begins, dtype=jnp.int32),

@@ -290,17 +290,11 @@ def weigh(
     """
     drawn = jax.lax.stop_gradient(sigma_s)
     ratio = jnp.where(drawn > 0, sigma_s / jnp.where(drawn > 0, drawn, 1.0), 1.0)
-    length, scattered = (jnp.broadcast_to(x, weights.carried.shape) for x in (length, scattered))
-    removal = of_layer(sigma_a + (sigma_s - drawn), layer) * length
-    absorbed = weights.carried * of_layer(sigma_a, layer) * length * mean_decay(removal)
-    ratio = jnp.where(scattered, of_layer(ratio, layer), 1.0)
-    layers = jnp.broadcast_to(
-        jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None],
-        weights.absorbed.shape,
-    )
-    is_in_layer = jnp.broadcast_to(layer, layers.shape) == layers
+    removal = of_layer(sigma_a + (sigma_s - drawn), layer) * length[None]
+    absorbed = weights.carried * of_layer(sigma_a, layer) * length[None] * mean_decay(removal)
+    ratio = jnp.where(scattered[None], of_layer(ratio, layer), 1.0)
+    layers = jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None]
     return PathWeights(
         weights.carried * jnp.exp(-removal) * ratio,
-        weights.absorbed
-        + jnp.where(is_in_layer, jnp.broadcast_to(absorbed, is_in_layer.shape), 0.0),
+        weights.absorbed + jnp.where(layer[None, None] == layers, absorbed[None], 0.0),
     )
