@@ -13,7 +13,13 @@ from jaxtyping import Array, Float
 from splatjax.scattering import AngularLaw, SingleScattering
 from splatjax.scene import StackedLights
 
-from ._specular import DirectionalAlbedo, average_albedo, directional_albedo, specular_lobe
+from ._specular import (
+    albedo_series,
+    average_albedo,
+    directional_albedo,
+    specular_lobe,
+    sum_albedo,
+)
 
 _LEAST_SHARE = 1e-4
 
@@ -41,9 +47,8 @@ def diffuse_transmission(
 
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14), with `e = 1`.
     """
-    transmitted = 1 - directional_albedo(mu, f0, roughness)
     average = jnp.maximum(average_transmission(f0, roughness, angles), _LEAST_SHARE)
-    leaves = jnp.moveaxis(angles(mu), -1, 0) * transmitted[None]
+    leaves = jnp.moveaxis(angles(mu), -1, 0) * (1 - directional_albedo(mu, f0, roughness))[None]
     return leaves / average.reshape(*average.shape, *[1] * (leaves.ndim - average.ndim))
 
 
@@ -144,7 +149,7 @@ def albedo_under(
     if there are many, the tables of the roughness are summed before.
     """
     if any(len(group.light_indices) > len(group.distinct) for group in groups):
-        return DirectionalAlbedo.of(f0, roughness)
+        return eqx.Partial(sum_albedo, albedo_series(f0, roughness))
     return lambda mu: directional_albedo(mu, f0, roughness)
 
 
@@ -154,8 +159,9 @@ def exit_transmission(
     """Compute the factor on diffuse light that leaves towards the eye, on average 1:
     `diffuse_transmission`.
     """
-    cosine = _cosine(points.normals, points.outgoing)
-    return diffuse_transmission(cosine, f0, points.roughness, angles)
+    return diffuse_transmission(
+        _cosine(points.normals, points.outgoing), f0, points.roughness, angles
+    )
 
 
 def reflected_radiance(
@@ -220,8 +226,7 @@ def single_scattered_radiance(
     reflects = albedo_under(groups, f0, points.roughness)
 
     def scattered(_, cosine):
-        enters = 1 - reflects(cosine)
-        return jnp.moveaxis(single.reflected(cosine, to_eye), -1, 0) * enters[None]
+        return jnp.moveaxis(single.reflected(cosine, to_eye), -1, 0) * (1 - reflects(cosine))[None]
 
     return sum_received(
         points.positions, points.normals, groups, points.visibility, scattered, single.channels

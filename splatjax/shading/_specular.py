@@ -4,12 +4,11 @@ and average albedo.
 
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.polynomial.chebyshev import chebder, chebpts1, chebvander
+from numpy.polynomial.chebyshev import chebpts1, chebvander
 
 from splatjax._chunking import map_chunks
 
@@ -152,31 +151,16 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
     return coefficients, np.einsum("pi,tij->tpj", average, coefficients)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _chebyshev_basis(x: Float[Array, "*points"], count: int) -> Float[Array, "basis *points"]:
-    """Evaluate the first Chebyshev polynomials `T_n(x)`, in a loop: it compiles quickly."""
-
-    def add(n, rows):
-        following = 2 * x * rows[n - 1] - rows[n - 2]
-        return rows.at[n].set(following)
-
-    rows = jnp.zeros((count, *x.shape), x.dtype).at[0].set(1).at[1].set(x)
-    return jax.lax.fori_loop(2, count, add, rows)
-
-
-@_chebyshev_basis.defjvp
-def _chebyshev_basis_jvp(count, primals, tangents):
-    # The derivatives of the polynomials are sums of the polynomials.
-    basis = _chebyshev_basis(*primals, count)
-    derivatives = np.pad(chebder(np.eye(count)), ((0, 1), (0, 0))).T
-    slopes = jnp.tensordot(jnp.asarray(derivatives, basis.dtype), basis, 1)
-    return basis, slopes * tangents[0][None]
-
-
 def _roughness_basis(roughness: Float[Array, "*points"]) -> Float[Array, "basis *points"]:
+    """Evaluate the Chebyshev polynomials of `log m`, in a loop: it compiles quickly."""
     low, high = _LOG_ROUGHNESS
     t = (2 * jnp.log(jnp.clip(roughness, *ROUGHNESS_RANGE)) - (low + high)) / (high - low)
-    return _chebyshev_basis(t, _ROUGHNESS_NODES)
+
+    def step(rows, _):
+        row, following = rows
+        return (following, 2 * t * following - row), row
+
+    return jax.lax.scan(step, (jnp.ones_like(t), t), length=_ROUGHNESS_NODES)[1]
 
 
 def _with_fresnel(tables: np.ndarray, f0: Float[Array, ""]) -> Float[Array, "..."]:
@@ -185,58 +169,33 @@ def _with_fresnel(tables: np.ndarray, f0: Float[Array, ""]) -> Float[Array, "...
     return f0 * constant + (grazing_reflectance(f0) - f0) * grazing
 
 
-class DirectionalAlbedo(eqx.Module):
-    r"""The fraction of light from one direction that a rough interface reflects, `rho(mu)`, by a
-    specular lobe of strength 1.
+def _sum_over_roughness(
+    table: Float[Array, "rows basis"], roughness: Float[Array, "*points"]
+) -> Float[Array, "rows *points"]:
+    """Sum series in `log m` at the roughness of each point."""
+    sums = map_chunks(
+        lambda part: (table @ _roughness_basis(part)).T, roughness.reshape(-1), at_once=_AT_ONCE
+    )
+    return sums.T.reshape(-1, *roughness.shape)
 
-    `rho = f0 a(mu, m) + (g - f0) b(mu, m)`, g the `grazing_reflectance`: Schlick's term splits the
-    integral of `specular_lobe` over the hemisphere into two tables, computed once by quadrature and
-    kept as Chebyshev series in `sqrt(mu)` and `log m`.
 
-    **Attributes:**
+def albedo_series(
+    f0: Float[Array, "..."], roughness: Float[Array, "*points"]
+) -> Float[Array, "terms *points"]:
+    """Compute the series of `directional_albedo` in `sqrt(mu)` for the roughness of each point."""
+    return _sum_over_roughness(_with_fresnel(_tables()[0], f0), roughness)
 
-    - `series`: coefficients over `sqrt(mu)` for the roughness of each point.
 
-    **Source:** the lobe of Kelemen and Szirmay-Kalos 2001, as normalized in `specular_lobe`.
-    """
-
-    series: Float[Array, "terms *#points"]
-
-    @classmethod
-    def of(
-        cls, f0: Float[Array, "..."], roughness: Float[Array, "*#points"]
-    ) -> "DirectionalAlbedo":
-        """Sum the series in `log m`.
-
-        **Arguments:**
-
-        - `f0`: reflectance at normal incidence. Differentiable.
-        - `roughness`: m, clamped to [0.05, 1] as in the lobe. Differentiable.
-        """
-        tables = _with_fresnel(_tables()[0], f0)
-        rows = map_chunks(
-            lambda part: (tables @ _roughness_basis(part)).T,
-            roughness.reshape(-1),
-            at_once=_AT_ONCE,
-        )
-        return cls(rows.T.reshape(-1, *roughness.shape))
-
-    def __call__(self, mu: Float[Array, "*points"]) -> Float[Array, "*points"]:
-        """Sum the series in `sqrt(mu)`.
-
-        **Arguments:**
-
-        - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the
-          slope at `mu = 0` diverges like `log mu` and is cut to 0 below 1e-5.
-
-        **Returns:** in [0, 1], within 2e-4 of the integral.
-        """
-        x = 2 * jnp.sqrt(jnp.clip(mu, _LEAST_MU, 1.0)) - 1
-        first, *others = self.series
-        following = after = jnp.zeros_like(x)
-        for row in reversed(others):  # Clenshaw's recurrence
-            following, after = row + 2 * x * following - after, following
-        return jnp.clip(first + x * following - after, 0.0, 1.0)
+def sum_albedo(
+    series: Float[Array, "terms *#points"], mu: Float[Array, "*points"]
+) -> Float[Array, "*points"]:
+    """Sum the series of `directional_albedo`."""
+    x = 2 * jnp.sqrt(jnp.clip(mu, _LEAST_MU, 1.0)) - 1
+    first, *others = series
+    following = after = jnp.zeros_like(x)
+    for row in reversed(others):  # Clenshaw's recurrence
+        following, after = row + 2 * x * following - after, following
+    return jnp.clip(first + x * following - after, 0.0, 1.0)
 
 
 def directional_albedo(
@@ -244,14 +203,29 @@ def directional_albedo(
     f0: Float[Array, "..."],
     roughness: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    """Compute the `DirectionalAlbedo` of a rough interface for one direction; `mu` and `roughness`
-    broadcast.
+    r"""Compute the fraction of light from one direction that a rough interface reflects, `rho(mu)`,
+    by a specular lobe of strength 1.
+
+    `rho = f0 a(mu, m) + (g - f0) b(mu, m)`, g the `grazing_reflectance`: Schlick's term splits the
+    integral of `specular_lobe` over the hemisphere into two tables, computed once by quadrature and
+    kept as Chebyshev series in `sqrt(mu)` and `log m`.
+
+    **Arguments:** `mu` and `roughness` broadcast.
+
+    - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the slope
+      at `mu = 0` diverges like `log mu` and is cut to 0 below 1e-5.
+    - `f0`: reflectance at normal incidence. Differentiable.
+    - `roughness`: m, clamped to [0.05, 1] as in the lobe. Differentiable.
+
+    **Returns:** in [0, 1], within 2e-4 of the integral.
+
+    **Source:** the lobe of Kelemen and Szirmay-Kalos 2001, as normalized in `specular_lobe`.
     """
     if not roughness.ndim:
-        return DirectionalAlbedo.of(f0, roughness)(mu)
+        return sum_albedo(albedo_series(f0, roughness), mu)
     mu, roughness = jnp.broadcast_arrays(mu, roughness)
     flat = map_chunks(
-        lambda mu, m: DirectionalAlbedo.of(f0, m)(mu),
+        lambda mu, m: sum_albedo(albedo_series(f0, m), mu),
         *(mu.reshape(-1), roughness.reshape(-1)),
         at_once=_AT_ONCE,
     )
@@ -271,7 +245,5 @@ def average_albedo(
 
     - `factor`: `c_k`, at most 8 powers.
     """
-    series = factor.T @ _with_fresnel(_tables()[1][:, : len(factor)], f0)
-    along = roughness.reshape(-1)
-    averages = map_chunks(lambda part: (series @ _roughness_basis(part)).T, along, at_once=_AT_ONCE)
-    return averages.T.reshape(-1, *roughness.shape)
+    averages = factor.T @ _with_fresnel(_tables()[1][:, : len(factor)], f0)
+    return _sum_over_roughness(averages, roughness)
