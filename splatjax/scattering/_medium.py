@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, is_traced, numbers, record, valid
+from splatjax._records import check_values, is_traced, numbers, record, require, valid
 
 from ._quadrature import unit_interval
 
@@ -124,20 +124,18 @@ def check_stack(layers: tuple[Layer | Film, ...]) -> None:
     thicknesses are not checked.
     """
     scattering = {layer.channels for layer in layers if isinstance(layer, Layer)}
-    if not scattering:
-        raise ValueError(
-            f"layers must contain a scattering Layer; none of these {len(layers)} is one"
-        )
+    require(
+        scattering, f"layers must contain a scattering Layer; none of these {len(layers)} is one"
+    )
     films = {layer.optical_depth.shape[-1] for layer in layers if isinstance(layer, Film)}
     counts = scattering | (films - {1})
-    if len(counts) > 1:
-        raise ValueError(f"layers have {sorted(counts)} channels; give all the same number")
+    require(len(counts) < 2, f"layers have {sorted(counts)} channels; give all the same number")
     for number, layer in enumerate(layers[:-1], start=1):
         thickness = layer.thickness if isinstance(layer, Layer) else 0.0
-        if not is_traced(thickness) and np.isinf(thickness):
-            raise ValueError(
-                f"layer {number} of {len(layers)} is infinitely thick; only the lowest may be"
-            )
+        require(
+            is_traced(thickness) or np.isfinite(thickness),
+            f"layer {number} of {len(layers)} is infinitely thick; only the lowest may be",
+        )
 
 
 class AbstractFresnel(eqx.Module):
@@ -261,5 +259,4 @@ def _over_reflections(ratio: Float[Array, " channels"], factor) -> Float[Array, 
     x, _, weights = (jnp.asarray(values, ratio.dtype)[:, None] for values in unit_interval())
     s = normal + (1 - normal) * x
     along = (s - b) / (s * (1 - b * s))
-    integrand = (1 - normal) * (1 - s * s) * (1 + along * along) * factor(s)
-    return jnp.sum(weights * integrand, axis=0)
+    return jnp.sum(weights * (1 - normal) * (1 - s * s) * (1 + along * along) * factor(s), axis=0)

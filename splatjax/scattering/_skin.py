@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, numbers, record, valid
+from splatjax._records import check_values, numbers, record, require, valid
 from splatjax._smooth import mean_decay
 from splatjax.gaussians import AbstractProfile
 
@@ -231,18 +231,25 @@ class Skin(eqx.Module):
     )
 
     def __check_init__(self):
-        together = self.water + self.blood
-        check_values("Skin.water and blood together", together, "at most 1", lambda x: x < 1 + 1e-6)
-        if np.shape(self.wavelengths) == (0,):
-            raise ValueError("Skin.wavelengths is empty; give one wavelength (nm) or more")
+        check_values(
+            "Skin.water and blood together",
+            self.water + self.blood,
+            "at most 1",
+            lambda x: x < 1 + 1e-6,
+        )
+        require(
+            np.shape(self.wavelengths) != (0,),
+            "Skin.wavelengths is empty; give one wavelength (nm) or more",
+        )
 
     @jit_unless_traced
     def media(self) -> tuple[Medium, Medium]:
         """Compute the coefficients of epidermis and dermis."""
         pure = _pigment_absorption(self.wavelengths)
         melanin = self.eumelanin * pure["eumelanin"] + (1 - self.eumelanin) * pure["pheomelanin"]
-        oxygenation = self.oxygenation
-        blood = oxygenation * pure["oxygenated"] + (1 - oxygenation) * pure["deoxygenated"]
+        blood = pure["deoxygenated"] + self.oxygenation * (
+            pure["oxygenated"] - pure["deoxygenated"]
+        )
         water_and_carotene = self.water * pure["water"] + self.carotene * pure["carotene"]
         epidermis = self.melanin * melanin + (1 - self.melanin) * pure["baseline"]
         blood = blood * mean_decay(2 * self.vessel_radius * blood)

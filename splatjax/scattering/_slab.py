@@ -189,8 +189,9 @@ class AbstractSlabProfile(AbstractProfile):
             if isinstance(layer, Film):
                 responses.append(film_response(layer, passed == 0, k.shape))
             else:
-                neighbors = etas[passed], etas[passed + 2]
-                responses.append(slab_response(layer, *neighbors, self.fresnel, k))
+                responses.append(
+                    slab_response(layer, etas[passed], etas[passed + 2], self.fresnel, k)
+                )
                 passed += 1
         return reduce(Response.over, responses)
 
