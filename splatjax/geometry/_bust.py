@@ -13,8 +13,7 @@ from splatjax.cache import kept
 from splatjax.scene import Splats
 
 from ._mesh import Mesh, unit, vertex_normals
-from ._sample import splats_at
-from ._scatter import scatter
+from ._sample import sample_mesh
 
 _STEP, _TILT = 0.01, 0.002  # units in the file, of positions (mm) and of normals
 _MIDDLE = np.asarray([0.0, -30.0, -10.0])
@@ -59,8 +58,7 @@ def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
 
     **Raises:** `ValueError` when `count` is below 1.
     """
-    mesh = bust_mesh()
-    splats = splats_at(mesh, scatter(mesh, count, seed=seed, relaxations=2), rounded=True)
+    splats = sample_mesh(bust_mesh(), count, seed=seed, rounded=True, relaxations=2)
     colors = complexion(np.asarray(splats.centers, np.float64))
     return Splats(splats.centers, splats.normals, splats.radii, splats.areas, *colors)
 

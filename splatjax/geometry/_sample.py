@@ -122,6 +122,7 @@ def sample_mesh(
     textures: Textures = Textures(),
     seed: int = 0,
     rounded: bool = False,
+    relaxations: int = 4,
 ) -> Splats:
     r"""Sample evenly spread splats from a mesh, with its textures.
 
@@ -133,6 +134,7 @@ def sample_mesh(
     - `seed`: seed of the random positions; the same seed gives the same splats.
     - `rounded`: place splats on a curved surface that follows the mesh's normals, instead of on
       flat triangles.
+    - `relaxations`: number of times that splats are moved to the centroids of their cells.
 
     **Returns:** splats in Morton order, in JAX's default precision. Their areas are the areas of
     their Voronoi cells on the surface, all scaled by one factor so that they add up to the
@@ -142,13 +144,7 @@ def sample_mesh(
     **Raises:** `ValueError` for a count below 1, a mesh without area, or textures on a mesh without
     UVs.
     """
-    return splats_at(mesh, scatter(mesh, count, seed=seed), textures, rounded=rounded)
-
-
-def splats_at(
-    mesh: Mesh, points: SurfacePoints, textures: Textures = Textures(), *, rounded: bool = False
-) -> Splats:
-    """Make splats from points on a mesh, with its textures, like `sample_mesh`."""
+    points = scatter(mesh, count, seed=seed, relaxations=relaxations)
     centers, area = points.positions(mesh), mesh.area()
     if rounded:
         rounding = Rounding(mesh)
@@ -158,7 +154,6 @@ def splats_at(
     images = mirror_images(mesh, faces_beyond(mesh), centers, spacing)
     areas, reaches, _ = surface_cells(centers, normals, images, limit=spacing)
     areas = areas * (area / areas.sum())
-    radii = _radii(areas, reaches, images, spacing)
     specular, roughness, tangent_space = (
         lookup_at(mesh, points, getattr(textures, name))
         for name in ("specular", "roughness", "normal")
@@ -177,8 +172,16 @@ def splats_at(
     weights = None if textures.weights is None else textures.weights(values)
     if tangent_space is not None:
         normals = perturbed_normals(mesh, points, normals, tangent_space)
-    albedo = albedo_at(textures, mesh, points)
-    return Splats(centers, normals, radii, areas, albedo, specular, roughness, weights)
+    return Splats(
+        centers,
+        normals,
+        _radii(areas, reaches, images, spacing),
+        areas,
+        albedo_at(textures, mesh, points),
+        specular,
+        roughness,
+        weights,
+    )
 
 
 def _radii(

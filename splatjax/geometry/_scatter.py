@@ -3,12 +3,13 @@ Voronoi cells in the tangent planes.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float, Int
+
+from splatjax._records import require
 
 from ._mesh import Mesh, distinct, faces_beyond, hard_edges, morton_order, unit
 
@@ -153,13 +154,15 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
 
     **Raises:** `ValueError` when `count` is below 1 or the mesh has no area.
     """
-    if not isinstance(count, Real) or count < 1:
-        raise ValueError(f"count is {count!r}; at least one splat is needed")
+    require(
+        isinstance(count, int | float | np.number) and count >= 1,
+        f"count is {count!r}; at least one splat is needed",
+    )
     areas = mesh.face_areas()
-    if not areas.sum() > 0:
-        raise ValueError(
-            "the mesh has no area; it needs at least one triangle that is not degenerate"
-        )
+    require(
+        areas.sum() > 0,
+        "the mesh has no area; it needs at least one triangle that is not degenerate",
+    )
     random = np.random.default_rng(seed)
     along = morton_order(mesh.corners().mean(axis=1))
     ends = np.cumsum(areas[along])
