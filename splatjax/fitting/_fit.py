@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
 from splatjax._format import channel_names, format_numbers
-from splatjax._records import Numbers, as_floats, is_traced
+from splatjax._records import Numbers, as_floats, is_traced, require
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
@@ -45,17 +45,16 @@ class ErrorByCount(eqx.Module):
         **Raises:** `ValueError` if no number suffices, or inside `jit`, because the answer depends
         on values.
         """
-        if is_traced(self.error):
-            raise ValueError(
-                "the least number of Gaussians depends on values; compute it outside of jit "
-                "and vmap"
-            )
+        require(
+            not is_traced(self.error),
+            "the least number of Gaussians depends on values; compute it outside of jit and vmap",
+        )
         worst = np.max(np.asarray(self.error), axis=1)
-        if not error > 0 or not np.any(worst <= error):
-            raise ValueError(
-                f"error is {error:g}, and {len(worst)} Gaussians reach {worst[-1]:.2e} (worst "
-                "channel); give a larger error, or allow more Gaussians"
-            )
+        require(
+            error > 0 and np.any(worst <= error),
+            f"error is {error:g}, and {len(worst)} Gaussians reach {worst[-1]:.2e} (worst "
+            "channel); give a larger error, or allow more Gaussians",
+        )
         return int(np.argmax(worst <= error)) + 1
 
     def start(self, count: int) -> GivenVariances:
@@ -90,8 +89,7 @@ def error_by_count(
     def search(problem: FitProblem, _):
         def summarize(point, count):
             active = jnp.arange(max_count) < count
-            residuals = problem.residuals(point, active)
-            error = jnp.sqrt(jnp.sum(residuals * residuals, axis=1))
+            error = jnp.sqrt(jnp.sum(problem.residuals(point, active) ** 2, axis=1))
             return error, jnp.where(active, problem.variances(point), jnp.inf)
 
         return jax.vmap(summarize)(greedy_path(problem, max_count), jnp.arange(1, max_count + 1))
@@ -119,8 +117,10 @@ class LeastCount(eqx.Module):
 
 def check_count(name: str, count: int) -> None:
     """Raise `ValueError` for a number of Gaussians that is not a positive integer."""
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ValueError(f"{name} must be a whole number of Gaussians, at least 1; got {count!r}")
+    require(
+        isinstance(count, int) and not isinstance(count, bool) and count >= 1,
+        f"{name} must be a whole number of Gaussians, at least 1; got {count!r}",
+    )
 
 
 class FitResult(eqx.Module):
@@ -218,11 +218,11 @@ def fit_gaussians(
     **Source:** Kim et al. 2010, Eq. 3; variable projection: Golub and Pereyra 1973.
     """
     if isinstance(count, LeastCount):
-        if start is not None:
-            raise ValueError(
-                f"start is given together with {count}, which computes its own start; leave "
-                "start out, or give a count"
-            )
+        require(
+            start is None,
+            f"start is given together with {count}, which computes its own start; leave start "
+            "out, or give a count",
+        )
         by_count = error_by_count(
             profile, count.max_count, spread=spread, weights=weights, rule=rule
         )

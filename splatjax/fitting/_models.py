@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from splatjax._records import as_floats, check_values, numbers
+from splatjax._records import as_floats, check_values, numbers, require
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
     L2_QUADRATURE,
@@ -99,8 +99,7 @@ class TransportModel(AbstractModel):
         return HalfSpace(medium, self.g)
 
     def profile(self, medium: Medium) -> PhotonBeam:
-        total = self.half_space(medium).total_reflectance()
-        return PhotonBeam(medium).with_total(total)
+        return PhotonBeam(medium).with_total(self.half_space(medium).total_reflectance())
 
     def angles(self, medium: Medium) -> AngularLaw:
         return self.half_space(medium).angular_law()
@@ -167,8 +166,12 @@ def weight_factors(
 @eqx.filter_jit
 def _fit_held(profile: AbstractProfile, variances: Float[Array, " gaussians"]):
     """Fit non-negative weights whose sum is the profile's total reflectance."""
-    held = NonNegativeWeights(FixedTotalReflectance())
-    return fit_weights(profile, variances, weights=held, rule=TransportModel.rule).weights
+    return fit_weights(
+        profile,
+        variances,
+        weights=NonNegativeWeights(FixedTotalReflectance()),
+        rule=TransportModel.rule,
+    ).weights
 
 
 class MediumFit(eqx.Module):
@@ -222,11 +225,11 @@ def fit_medium(
     do not match; an error with the message of `result` if `throw`.
     """
     channels = measured.values.shape[1]
-    if measured.deviation is None or start.channels != channels:
-        raise ValueError(
-            "fit_medium needs measured.deviation, the standard errors of its samples, and a start "
-            f"of {channels} channels; got {measured.deviation} and {start.channels} channels"
-        )
+    require(
+        measured.deviation is not None and start.channels == channels,
+        "fit_medium needs measured.deviation, the standard errors of its samples, and a start of "
+        f"{channels} channels; got {measured.deviation} and {start.channels} channels",
+    )
     check_values("measured.deviation", measured.deviation, "positive", lambda x: x > 0)
     fitted = _fit_compiled(
         measured,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from splatjax._chunking import jit_unless_traced
+from splatjax._records import require
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule, at_own_radii
 
@@ -18,12 +19,12 @@ def norm_radii(
     profile: AbstractProfile, rule: AbstractRadialRule
 ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
     """Compute radii and weights for integrals of `r R^2`; raise if the integral does not exist."""
-    if profile.singular and rule.reaches_origin:
-        raise ValueError(
-            f"{type(profile).__name__} diverges like 1/r, so the integral of r R^2 from 0 (Eq. "
-            "3) does not exist; give the rule of a model (TransportModel.rule), or the radius "
-            "where it starts, in length scales: rule=scattering.L2_QUADRATURE.beyond(1.0)"
-        )
+    require(
+        not (profile.singular and rule.reaches_origin),
+        f"{type(profile).__name__} diverges like 1/r, so the integral of r R^2 from 0 (Eq. 3) "
+        "does not exist; give the rule of a model (TransportModel.rule), or the radius where it "
+        "starts, in length scales: rule=scattering.L2_QUADRATURE.beyond(1.0)",
+    )
     return rule.radii(profile)
 
 
@@ -221,13 +222,12 @@ class FitProblem(eqx.Module):
         variances = self.variances(log_variances)[None, None]
         growth = 0.5 * self.squared_radii[..., None] / variances - 1
         slopes = basis * growth
-        curved = basis * (growth * growth - growth - 1)
         moved = -jnp.einsum(
             "cij,cjk->cik",
             response,
             jnp.einsum("cni,cnj->cij", basis, slopes) * coefficients[:, None, :],
         )
-        return slopes, curved, moved
+        return slopes, basis * (growth * growth - growth - 1), moved
 
     def energies(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
         """Compute the weight that gives a Gaussian unit norm: the integral of r G(v, r)^2 is 1 / (8
@@ -240,10 +240,10 @@ def make_problem(
     profile: AbstractProfile, weights: AbstractWeights, rule: AbstractRadialRule
 ) -> FitProblem:
     """Set up the fit of all channels of a profile."""
-    if not isinstance(profile, AbstractProfile):
-        raise ValueError(
-            f"profile must be a profile, such as Dipole(medium); got {type(profile).__name__}"
-        )
+    require(
+        isinstance(profile, AbstractProfile),
+        f"profile must be a profile, such as Dipole(medium); got {type(profile).__name__}",
+    )
     r, dr = norm_radii(profile, rule)
     values = at_own_radii(profile, r)
     norm = jnp.sqrt(jnp.sum(dr * r * values * values, axis=0))

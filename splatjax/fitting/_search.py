@@ -13,7 +13,7 @@ import optimistix as optx
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._records import check_values, numbers, record
+from splatjax._records import check_values, numbers, record, require
 from splatjax.scattering import Medium
 
 from ._problem import Expansion, FitProblem
@@ -59,11 +59,11 @@ class GivenVariances(eqx.Module):
 
     def search(self, problem: FitProblem, count: int) -> Float[Array, " gaussians"]:
         """Find nearly optimal log variances, ascending, of a problem in JAX's default precision."""
-        if self.variances.shape != (count,):
-            raise ValueError(
-                f"GivenVariances.variances must be {count}, one for each Gaussian and shared by "
-                f"the channels; got {list(self.variances.shape)}"
-            )
+        require(
+            self.variances.shape == (count,),
+            f"GivenVariances.variances must be {count}, one for each Gaussian and shared by the "
+            f"channels; got {list(self.variances.shape)}",
+        )
         return jnp.sort(_descend(problem, problem.log_variances(self.variances), None)[0])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import scipy  # its parts are loaded where they are used
 from jaxtyping import Array, Float
 
-from splatjax._records import Numbers, as_floats, check_values
+from splatjax._records import Numbers, as_floats, check_values, require
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 
 from ._models import weight_factors
@@ -62,10 +62,10 @@ class WeightTable(eqx.Module):
 
     def fractions(self, values: Mapping[str, Numbers]) -> Float[Array, "splats parameters"]:
         """Check values, and compute their positions in the ranges of their parameters, 0 to 1."""
-        if set(values) != set(self.names):
-            raise ValueError(
-                f"values are given for {', '.join(values)}; give {', '.join(self.names)}"
-            )
+        require(
+            set(values) == set(self.names),
+            f"values are given for {', '.join(values)}; give {', '.join(self.names)}",
+        )
         rows = [as_floats(values[name], self.at_nodes.dtype, name) for name in self.names]
         for name, row, (low, high) in zip(self.names, rows, np.asarray(self.limits), strict=True):
             limits = f"between {low:g} and {high:g}, the range of the table"
@@ -94,8 +94,7 @@ class WeightTable(eqx.Module):
         roots, totals = jnp.sqrt(self.at_nodes), jnp.sqrt(self._totals(self.at_nodes))
         factors = jnp.maximum(jnp.tensordot(shares, roots, 1), 0.0) ** 2
         sums = self._totals(factors)
-        total = (shares @ totals) ** 2
-        return factors * (total / jnp.where(sums > 0, sums, 1.0))[:, None]
+        return factors * ((shares @ totals) ** 2 / jnp.where(sums > 0, sums, 1.0))[:, None]
 
     def reflectance(
         self, fractions: Float[Array, "splats parameters"]
@@ -154,12 +153,13 @@ def weight_table(
     **Raises:** `ValueError` for another number of parameters, and for fewer than two nodes or nodes
     that do not ascend.
     """
-    if not 1 <= len(nodes) <= _MOST:
-        raise ValueError(f"nodes has {len(nodes)} parameters; give one to {_MOST}")
+    require(1 <= len(nodes) <= _MOST, f"nodes has {len(nodes)} parameters; give one to {_MOST}")
     grid = {name: np.asarray(values, np.float64) for name, values in nodes.items()}
     for name, values in grid.items():
-        if values.ndim != 1 or len(values) < 2 or not np.all(np.diff(values) > 0):
-            raise ValueError(f"nodes[{name!r}] must be two or more ascending numbers; got {values}")
+        require(
+            values.ndim == 1 and len(values) > 1 and np.all(np.diff(values) > 0),
+            f"nodes[{name!r}] must be two or more ascending numbers; got {values}",
+        )
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), base)
         factors = [
