@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from splatjax._records import check_values
-from splatjax.scene import AbstractLight, Material, Splats
+from splatjax._records import check_values, require
+from splatjax.scene import AbstractLight, Material, Splats, rotation_by
 
 from ._observation import PicturedScene
 
@@ -121,11 +121,11 @@ class LightStrengths(AbstractPart):
 
     def coordinates(self, pictured: PicturedScene) -> tuple[Float[Array, " channels"], ...]:
         for light in pictured.lights:
-            if not light.strength_field:
-                raise ValueError(
-                    f"{type(light).__name__}.strength_field names no field that LightStrengths "
-                    "can change"
-                )
+            require(
+                light.strength_field,
+                f"{type(light).__name__}.strength_field names no field that LightStrengths can "
+                "change",
+            )
         return tuple(
             jnp.zeros_like(getattr(light, light.strength_field)) for light in pictured.lights
         )
@@ -160,7 +160,7 @@ class LightPlaces(AbstractPart):
     def moved(self, pictured: PicturedScene, x, prepared) -> PicturedScene:
         def move(light: AbstractLight, steps: dict[str, Array]) -> AbstractLight:
             places = {
-                name: rotation(self.turn * step) @ getattr(light, name)
+                name: rotation_by(self.turn * step) @ getattr(light, name)
                 if name == "direction"
                 else getattr(light, name) + self.shift * step
                 for name, step in steps.items()
@@ -193,31 +193,13 @@ class CameraPoses(AbstractPart):
         return jnp.zeros((2, 3), pictured.camera.position.dtype)
 
     def moved(self, pictured: PicturedScene, x, prepared: Float[Array, "3"]) -> PicturedScene:
-        middle, camera, turned = prepared, pictured.camera, rotation(self.turn * x[0])
+        middle, camera, turned = prepared, pictured.camera, rotation_by(self.turn * x[0])
         position = middle + turned @ (camera.position - middle) + self.shift * x[1]
         return eqx.tree_at(
             lambda s: (s.camera.position, s.camera.rotation),
             pictured,
             (position, camera.rotation @ turned.T),
         )
-
-
-def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    r"""Compute the rotation around a vector by its length, radians. Differentiable at 0, too.
-
-        R = 1 + sin(t) / t [v] + (1 - cos t) / t^2 [v]^2,   t = |v|
-
-    **Source:** Rodrigues 1840.
-    """
-
-    def sinc(y):  # sin(t) / t of y = t^2, near 0 by its series
-        is_small = y < 1e-2
-        t = jnp.sqrt(jnp.where(is_small, 1.0, y))
-        return jnp.where(is_small, 1 - y / 6 * (1 - y / 20 * (1 - y / 42)), jnp.sin(t) / t)
-
-    squared, identity = vector @ vector, jnp.eye(3, dtype=vector.dtype)
-    cross = jnp.cross(identity, vector[None])
-    return identity + sinc(squared) * cross + 0.5 * sinc(squared / 4) ** 2 * (cross @ cross)
 
 
 class MovableScene(eqx.Module):

@@ -40,6 +40,7 @@ from ._scene import (
     Camera as Camera,
     Frame as Frame,
     Parts as Parts,
+    rotation_by as rotation_by,
     rotation_towards as rotation_towards,
     Scene as Scene,
     Splats as Splats,

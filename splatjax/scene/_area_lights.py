@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax._records import Numbers, as_floats, check_values, numbers, record
 
 from ._environment import even_directions
@@ -30,8 +31,8 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
     center: Float[Array, "3"] = eqx.field(converter=numbers)
     radiance: Float[Array, " channels"] = eqx.field(converter=numbers)
     strength_field: ClassVar[str] = "radiance"
+    # Area of the light divided by the area of the parallelogram that its first two axes span.
     area_factor: eqx.AbstractClassVar[float]
-    """Area of the light divided by the area of the parallelogram that its first two axes span."""
 
     @abc.abstractmethod
     def axes(self) -> Float[Array, "axes 3"]:
@@ -60,6 +61,7 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
         area = jnp.linalg.norm(across)
         return across / area if len(axes) == 2 else None, self.area_factor * area
 
+    @jit_unless_traced
     def stacked_samples(self) -> AbstractLightSample:
         axes, (normal, area) = self.axes(), self.normal_and_area()
         positions = self.center[None] + jnp.asarray(self.sample_offsets(), axes.dtype) @ axes

@@ -11,10 +11,11 @@ import numpy as np
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, DTypeLike, Float
 
-from splatjax._records import check_values, numbers, record
+from splatjax._chunking import jit_unless_traced
+from splatjax._records import check_values, numbers, record, require
 
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, DistantStratum
-from ._scene import Camera, Frame
+from ._scene import Camera, Frame, rotation_by
 
 _CELLS = 128  # along a side of the grid of equal areas that is cut into strata; a power of two
 _EVEN = 0.1  # fraction of uniform importance, so that no direction is far from a sample
@@ -69,11 +70,11 @@ class EnvironmentLight(AbstractExtendedLight):
 
     def __check_init__(self):
         height, width = getattr(self.image, "shape", (1, 2))[:2]
-        if width != 2 * height:
-            raise ValueError(
-                f"EnvironmentLight.image has {height} rows and {width} columns; give a "
-                "latitude-longitude map, twice as wide as high"
-            )
+        require(
+            width == 2 * height,
+            f"EnvironmentLight.image has {height} rows and {width} columns; give a "
+            "latitude-longitude map, twice as wide as high",
+        )
         if isinstance(self.directions, jax.Array):
             name, lengths = "EnvironmentLight.directions", jnp.linalg.norm(self.directions, axis=-1)
             check_values(f"the number of {name}", lengths.size, "at least 1", lambda n: n >= 1)
@@ -86,18 +87,16 @@ class EnvironmentLight(AbstractExtendedLight):
         """Compute the rotation from the directions of the image to directions in the world: about
         +y, then the shortest rotation from +y to `up`.
         """
-        angle = jnp.deg2rad(self.rotation)
-        cosine, sine, one = jnp.cos(angle), jnp.sin(angle), jnp.ones_like(angle)
-        zero = jnp.zeros_like(angle)
-        rows = [cosine, zero, sine, zero, one, zero, -sine, zero, cosine]
+        turn = rotation_by(jnp.deg2rad(self.rotation) * jnp.eye(3, dtype=self.up.dtype)[1])
         x, y, z = jnp.unstack(self.up / jnp.linalg.norm(self.up))
         is_down = (y < 0) & (x * x + z * z < 1e-12)  # half a turn about x
         x, z = jnp.where(is_down, 0.0, x), jnp.where(is_down, 1e-6, z)
         # 1 / (1 + y), without cancellation.
         lean = jnp.where(y < 0, 1 - y, 1.0) / jnp.where(y < 0, x * x + z * z, 1 + y)
         tilt = [1 - x * x * lean, x, -x * z * lean, -x, y, -z, -x * z * lean, z, 1 - z * z * lean]
-        return jnp.stack(tilt).reshape(3, 3) @ jnp.stack(rows).reshape(3, 3)
+        return jnp.stack(tilt).reshape(3, 3) @ turn
 
+    @jit_unless_traced
     def stacked_samples(self) -> AbstractLightSample:
         directions, solid_angles = pixel_directions(len(self.image), self.image.dtype)
         brightness = jnp.mean(self.image, axis=-1)
@@ -120,8 +119,9 @@ class EnvironmentLight(AbstractExtendedLight):
         is_filled = jnp.sum(towards**2, axis=-1, keepdims=True) > 0
         towards = jnp.where(is_filled, towards, jnp.asarray([[0.0, 1.0, 0.0]], towards.dtype))
         towards = towards / jnp.linalg.norm(towards, axis=-1, keepdims=True) @ self.to_world().T
-        sample = eqx.Partial(DistantStratum, cast_shadows=self.cast_shadows)
-        return jax.vmap(sample)(-towards, irradiance)
+        return jax.vmap(eqx.Partial(DistantStratum, cast_shadows=self.cast_shadows))(
+            -towards, irradiance
+        )
 
     def _distribute(
         self, directions: Float[Array, "height width 3"], moments: Float[Array, "height width sums"]
@@ -135,8 +135,7 @@ class EnvironmentLight(AbstractExtendedLight):
 
         def of_row(row):
             towards, moments = row
-            shares = jax.nn.softmax(concentration * towards @ samples.T, axis=1)
-            return shares.T @ moments
+            return jax.nn.softmax(concentration * towards @ samples.T, axis=1).T @ moments
 
         return jnp.sum(jax.lax.map(of_row, (directions, moments)), axis=0)
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import Numbers, as_floats, numbers, record
+from splatjax._records import Numbers, as_floats, numbers, record, require
 
 from ._environment import (
     EnvironmentLight,
@@ -54,11 +54,11 @@ class HarmonicLight(AbstractExtendedLight):
 
     def __check_init__(self):
         harmonics = getattr(self.coefficients, "shape", (1,))[0]
-        if math.isqrt(harmonics) ** 2 != harmonics or harmonics == 0:
-            raise ValueError(
-                f"HarmonicLight.coefficients has {harmonics} rows; give (order + 1)^2: 1, 4, 9, 16 "
-                "or 25"
-            )
+        require(
+            harmonics and math.isqrt(harmonics) ** 2 == harmonics,
+            f"HarmonicLight.coefficients has {harmonics} rows; give (order + 1)^2: 1, 4, 9, 16 or "
+            "25",
+        )
 
     @classmethod
     def of(cls, environment: EnvironmentLight, order: int = 4, **settings) -> "HarmonicLight":
@@ -70,22 +70,20 @@ class HarmonicLight(AbstractExtendedLight):
         radiance = environment.radiance()
         directions, solid_angles = pixel_directions(len(radiance), radiance.dtype)
         harmonics = spherical_harmonics(directions @ environment.to_world().T, order)
-        weighted = radiance * solid_angles[..., None]
-        return cls(jnp.einsum("hwb,hwc->bc", harmonics, weighted), **settings)
-
-    @property
-    def order(self) -> int:
-        return math.isqrt(len(self.coefficients)) - 1
+        return cls(jnp.einsum("hwb,hwc,hw->bc", harmonics, radiance, solid_angles), **settings)
 
     def radiance(self, directions: Float[Array, "*points 3"]) -> Float[Array, "*points channels"]:
         """Compute the radiance from world directions, unit vectors."""
-        return spherical_harmonics(directions, self.order) @ self.coefficients
+        order = math.isqrt(len(self.coefficients)) - 1
+        return spherical_harmonics(directions, order) @ self.coefficients
 
+    @jit_unless_traced
     def stacked_samples(self) -> AbstractLightSample:
         directions = jnp.asarray(even_directions(self.count), self.coefficients.dtype)
         irradiance = 4 * jnp.pi / self.count * self.radiance(directions)
-        stratum = eqx.Partial(HarmonicStratum, cast_shadows=self.cast_shadows)
-        return jax.vmap(stratum)(-directions, irradiance)
+        return jax.vmap(eqx.Partial(HarmonicStratum, cast_shadows=self.cast_shadows))(
+            -directions, irradiance
+        )
 
     def highlight(self) -> AbstractHighlight:
         dtype = self.coefficients.dtype

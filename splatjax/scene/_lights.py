@@ -5,7 +5,7 @@ surface towards the light.
 import abc
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax._chunking import jit_unless_traced
 from splatjax._records import check_values, is_traced, numbers, record, valid
 from splatjax._smooth import smooth_step
 from splatjax.gaussians import gaussian
@@ -66,16 +65,22 @@ class AbstractLight(eqx.Module):
 
     def __check_init__(self):
         for name in (field.name for field in dataclasses.fields(self)):
-            expected = _EXPECTED.get(name, ("finite", lambda x: x == x))
-            check_values(f"{type(self).__name__}.{name}", getattr(self, name), *expected)
+            check_values(
+                f"{type(self).__name__}.{name}",
+                getattr(self, name),
+                *_EXPECTED.get(name, ("finite", lambda x: x == x)),
+            )
 
     def with_channels(self, channels: int) -> "AbstractLight":
         """Repeat the strength of a light of one channel for all channels."""
         strength = getattr(self, self.strength_field, None)
         if strength is None or strength.shape != (1,):
             return self
-        repeated = jnp.broadcast_to(strength, (channels,))
-        return eqx.tree_at(lambda light: getattr(light, light.strength_field), self, repeated)
+        return eqx.tree_at(
+            lambda light: getattr(light, light.strength_field),
+            self,
+            jnp.broadcast_to(strength, (channels,)),
+        )
 
     @abc.abstractmethod
     def samples(self) -> tuple["AbstractLightSample", ...]:
@@ -94,14 +99,12 @@ class AbstractLight(eqx.Module):
 
 
 class AbstractLightSample(AbstractLight):
-    """A light from one point or direction. `cast_shadows`: whether it has a shadow map. Static."""
+    """A light from one point or direction."""
 
-    if TYPE_CHECKING:  # to type checkers an abstract variable is the first argument of a class
-
-        @property
-        def cast_shadows(self) -> bool: ...
-    else:
-        cast_shadows: eqx.AbstractVar[bool]
+    @property
+    @abc.abstractmethod
+    def cast_shadows(self) -> bool:
+        """Whether it has a shadow map: a static field of each class, with a default."""
 
     def samples(self) -> tuple["AbstractLightSample", ...]:
         """Return the light itself."""
@@ -137,13 +140,8 @@ class AbstractExtendedLight(AbstractLight):
         """Return the samples, stacked along the first axis of every leaf."""
 
     def samples(self) -> tuple[AbstractLightSample, ...]:
-        leaves, structure = jax.tree.flatten(_stacked_samples(self))
+        leaves, structure = jax.tree.flatten(self.stacked_samples())
         return tuple(map(structure.unflatten, zip(*map(_rows, leaves), strict=True)))
-
-
-@jit_unless_traced
-def _stacked_samples(light: AbstractExtendedLight) -> AbstractLightSample:
-    return light.stacked_samples()
 
 
 def _rows(leaf: Float[Array, "rows ..."]) -> Sequence[Float[Array, "..."]]:
@@ -274,7 +272,7 @@ class DistantStratum(AbstractLightSample):
     direction: Float[Array, "3"]
     irradiance: Float[Array, " channels"]
     strength_field: ClassVar[str] = "irradiance"
-    cast_shadows: bool = eqx.field(static=True)
+    cast_shadows: bool = eqx.field(static=True, default=True)
     incidence = DirectionalLight.incidence
 
 
@@ -289,7 +287,7 @@ class EmitterStratum(AbstractPointSample):
     position: Float[Array, "3"]
     intensity: Float[Array, " channels"]
     normal: Float[Array, "3"] | None
-    cast_shadows: bool = eqx.field(static=True)
+    cast_shadows: bool = eqx.field(static=True, default=True)
 
     def incidence(
         self, points: Float[Array, "*points 3"]

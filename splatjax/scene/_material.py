@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax._records import check_values, numbers, record, valid
+from splatjax._records import check_values, numbers, record, require, valid
 from splatjax.fitting import (
     AbstractModel,
     FixedTotalReflectance,
@@ -78,12 +78,12 @@ class Material(eqx.Module):
         steps = jnp.diff(self.wavelengths) if isinstance(self.wavelengths, jax.Array) else None
         check_values("the steps of Material.wavelengths", steps, "positive (nm)", lambda x: x > 0)
         for name in ("single_scattering", "angles"):
-            term = getattr(self, name)
-            if term is not None and term.channels != self.channels:
-                raise ValueError(
-                    f"Material.{name} has {term.channels} channels, and Material.gaussians has "
-                    f"{self.channels}; give both the same number"
-                )
+            channels = getattr(getattr(self, name), "channels", self.channels)
+            require(
+                channels == self.channels,
+                f"Material.{name} has {channels} channels, and Material.gaussians has "
+                f"{self.channels}; give both the same number",
+            )
 
     @classmethod
     def of_medium(
@@ -107,8 +107,12 @@ class Material(eqx.Module):
 
         **Raises:** `ValueError` as `fit_gaussians` does.
         """
-        held = NonNegativeWeights(FixedTotalReflectance())
-        fitted = fit_gaussians(model.profile(medium), count, weights=held, rule=model.rule)
+        fitted = fit_gaussians(
+            model.profile(medium),
+            count,
+            weights=NonNegativeWeights(FixedTotalReflectance()),
+            rule=model.rule,
+        )
         surface = {"eta": medium.eta[0]} | surface
         return cls(fitted.gaussians, angles=model.angles(medium), medium=medium, **surface)
 

@@ -20,6 +20,7 @@ from splatjax._records import (
     is_traced,
     numbers,
     record,
+    require,
     several,
     valid,
 )
@@ -113,14 +114,16 @@ class Camera(eqx.Module):
                 f"finite and below {_FARTHEST:g} mm",
                 lambda x: np.abs(x) < _FARTHEST,
             )
-            if not np.linalg.norm(direction) > 0:
-                raise ValueError(f"eye and target are both {checked[0].tolist()}; move one of them")
+            require(
+                np.linalg.norm(direction) > 0,
+                f"eye and target are both {checked[0].tolist()}; move one of them",
+            )
             smallest = _PARALLEL * np.linalg.norm(direction) * np.linalg.norm(checked[2])
-            if not np.linalg.norm(np.cross(direction, checked[2])) > smallest:
-                raise ValueError(
-                    f"up is {checked[2].tolist()}, along the line of sight; give another, such as "
-                    "[0, 0, -1] to look down"
-                )
+            require(
+                np.linalg.norm(np.cross(direction, checked[2])) > smallest,
+                f"up is {checked[2].tolist()}, along the line of sight; give another, such as "
+                "[0, 0, -1] to look down",
+            )
         rotation = rotation_towards(forward / jnp.linalg.norm(forward), up)
         focal_length = as_floats(0.5 / math.tan(math.radians(fov) / 2), eye.dtype)
         return cls(eye, rotation, focal_length, width, height, near)
@@ -131,6 +134,24 @@ def rotation_towards(forward: Float[Array, "3"], up: Float[Array, "3"]) -> Float
     right = jnp.cross(forward, up)
     right = right / jnp.linalg.norm(right)
     return jnp.stack([right, jnp.cross(forward, right), forward])
+
+
+def rotation_by(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    r"""Compute the rotation around a vector by its length, radians. Differentiable at 0, too.
+
+        R = 1 + sin(t) / t [v] + (1 - cos t) / t^2 [v]^2,   t = |v|
+
+    **Source:** Rodrigues 1840.
+    """
+
+    def sinc(y):  # sin(t) / t of y = t^2, near 0 by its series
+        is_small = y < 1e-2
+        t = jnp.sqrt(jnp.where(is_small, 1.0, y))
+        return jnp.where(is_small, 1 - y / 6 * (1 - y / 20 * (1 - y / 42)), jnp.sin(t) / t)
+
+    squared, identity = vector @ vector, jnp.eye(3, dtype=vector.dtype)
+    cross = jnp.cross(identity, vector[None])
+    return identity + sinc(squared) * cross + 0.5 * sinc(squared / 4) ** 2 * (cross @ cross)
 
 
 _ROUNDING = 1e-5  # by which an albedo may leave [0, 1]
@@ -195,8 +216,11 @@ class Splats(eqx.Module):
         """Scale the body about the origin. The distance that light travels does not change, so a
         smaller body is more translucent.
         """
-        scaled = self.centers * factor, self.radii * factor, self.areas * (factor * factor)
-        return eqx.tree_at(lambda body: (body.centers, body.radii, body.areas), self, scaled)
+        return eqx.tree_at(
+            lambda body: (body.centers, body.radii, body.areas),
+            self,
+            (self.centers * factor, self.radii * factor, self.areas * (factor * factor)),
+        )
 
     def without_maps(self) -> "Splats":
         """Remove albedo, specular and roughness: the material alone gives color and highlights."""
@@ -209,8 +233,8 @@ class Splats(eqx.Module):
         return jax.tree.map(lambda leaf: take_rows(leaf, chosen), self)
 
 
+# A function that returns all splats part by part, the same parts at every call.
 Parts: TypeAlias = Callable[[], Iterable[Splats]]
-"""A function that returns all splats part by part, the same parts at every call."""
 
 
 @record

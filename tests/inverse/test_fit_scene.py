@@ -24,7 +24,7 @@ import splatjax as sj
 from splatjax.inverse import _fit_scene
 from splatjax.inverse._fit_scene import MovableScene
 from splatjax.inverse._observation import Evidence, PicturedScene
-from splatjax.inverse._parts import rotation
+from splatjax.scene import rotation_by
 
 SIZE = 16
 camera = partial(view, size=SIZE)
@@ -229,7 +229,7 @@ class TestFitScene:
 
     def test_a_camera_comes_back(self):
         right = camera()
-        turned = rotation(jnp.asarray([0.03, -0.04, 0.02]))
+        turned = rotation_by(jnp.asarray([0.03, -0.04, 0.02]))
         position = turned @ right.position + jnp.asarray([0.4, -0.3, 1.0])
         off = eqx.tree_at(
             lambda c: (c.position, c.rotation), right, (position, right.rotation @ turned.T)

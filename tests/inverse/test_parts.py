@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 import splatjax as sj
 from splatjax.inverse import _fit_scene
 from splatjax.inverse._observation import PicturedScene
-from splatjax.inverse._parts import rotation
+from splatjax.scene import rotation_by
 
 COUNT, SIZE, NOISE = 12, 6, 1e-3
 FALLS = np.asarray([[[0.5, 2.0], [1.0, 3.0]], [[1.0, 0.3], [2.0, 0.5]]])
@@ -207,14 +207,14 @@ def moved_by(part, splats: sj.Splats, x) -> sj.Splats:
 @pytest.mark.parametrize("length", [0.0, 1e-9, 0.05, 0.0999, 0.1001, 1.0, 3.0])
 def test_a_rotation_is_that_of_its_vector(length, x64):
     vector = length * np.asarray([2.0, -1.0, 2.0]) / 3
-    found = jax.jit(rotation)(jnp.asarray(vector))
+    found = jax.jit(rotation_by)(jnp.asarray(vector))
     np.testing.assert_allclose(
         found, Rotation.from_rotvec(vector).as_matrix(), atol=1e-14 if x64 else 1e-6
     )
 
 
 def test_a_rotation_has_a_derivative_where_there_is_none():
-    slope = np.asarray(jax.jit(jax.jacobian(rotation))(jnp.zeros(3)))
+    slope = np.asarray(jax.jit(jax.jacobian(rotation_by))(jnp.zeros(3)))
     for axis in np.eye(3):
         np.testing.assert_allclose(slope @ axis, np.cross(axis, np.eye(3)).T, atol=1e-7)
 
