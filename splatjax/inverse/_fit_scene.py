@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from splatjax._precision import full_precision
-from splatjax._records import as_floats
+from splatjax._records import as_floats, require
 from splatjax.render import Plan, RenderSettings, render
 from splatjax.scene import Material, Splats
 
@@ -194,8 +194,14 @@ def fit_scene(
         expected, state = jax.tree.map(jnp.zeros_like, scene.prior_residuals(x)), None
         best, at, losses, pictures, residuals = None, x, [], (), ()
     else:
-        _check_start(start, scene.start(pictured_scenes), len(observations))
         x, state = start.state.x, start.state.optimizer
+        ours, given = (jax.tree.map(jnp.shape, y) for y in (scene.start(pictured_scenes), x))
+        require(
+            ours == given and len(start.state.plans) == len(observations),
+            f"start is a fit of {len(start.state.plans)} pictures with coordinates {given}; "
+            f"{len(observations)} pictures with {ours} are given. Continue with the same parts, "
+            "splats and number of pictures",
+        )
         plans, times, expected = start.state.plans, start.plans, start.state.expected
         at, losses = start.coordinates, start.losses.tolist()
         pictures, residuals = jax.tree.map(np.asarray, (start.pictures, start.residuals))
@@ -257,35 +263,25 @@ def fit_scene(
     return result.error_if(fitted, result != optx.RESULTS.successful) if throw else fitted
 
 
-def _check_start(start: FittedScene, x: Coordinates, pictures: int) -> None:
-    """Raise `ValueError` for a fit of other parts, splats or pictures."""
-    ours, given = (jax.tree.map(jnp.shape, coordinates) for coordinates in (x, start.state.x))
-    if ours != given or len(start.state.plans) != pictures:
-        raise ValueError(
-            f"start is a fit of {len(start.state.plans)} pictures with coordinates {given}; "
-            f"{pictures} pictures with {ours} are given. Continue with the same parts, splats and "
-            "number of pictures"
-        )
-
-
 def _check(
     observations: list[Observation], material: Material, parts: list[AbstractPart], steps: int
 ) -> None:
-    if not observations or not parts or steps < 1:
-        raise ValueError(
-            "at least one observation, one part and one step are needed; got "
-            f"{len(observations)}, {len(parts)} and {steps}"
-        )
+    require(
+        observations and parts and steps > 0,
+        "at least one observation, one part and one step are needed; got "
+        f"{len(observations)}, {len(parts)} and {steps}",
+    )
     for part in parts:
         part.check_material(material)
     kinds = [type(part).__name__ for part in parts]
-    if len(set(kinds)) < len(kinds):
-        raise ValueError(f"each kind of part may be given once; parts are {', '.join(kinds)}")
+    require(
+        len(set(kinds)) == len(kinds),
+        f"each kind of part may be given once; parts are {', '.join(kinds)}",
+    )
     check_channels(observations, material.channels, "material")
     for i, observation in enumerate(observations):
-        if not isinstance(observation.intensity, KnownIntensity):
-            raise ValueError(
-                f"observations[{i}].intensity is {type(observation.intensity).__name__}(), "
-                "which is for recover; for unknown strengths of lights, add LightStrengths to "
-                "parts"
-            )
+        require(
+            isinstance(observation.intensity, KnownIntensity),
+            f"observations[{i}].intensity is {type(observation.intensity).__name__}(), which is "
+            "for recover; for unknown strengths of lights, add LightStrengths to parts",
+        )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, DTypeLike, Float
 
-from splatjax._records import numbers, record, several, valid
+from splatjax._records import numbers, record, require, several, valid
 from splatjax.scene import (
     AbstractLight,
     Camera,
@@ -96,12 +96,12 @@ class Observation(eqx.Module):
     def __check_init__(self):
         size = self.camera.height, self.camera.width
         for name in ("picture", "mask"):
-            value = getattr(self, name)
-            if value is not None and value.shape[:2] != size:
-                raise ValueError(
-                    f"Observation.{name} has {value.shape[0]} x {value.shape[1]} pixels, its "
-                    f"camera {size[0]} x {size[1]} (height, width)"
-                )
+            pixels = np.shape(getattr(self, name))[:2] or size  # there may be no mask
+            require(
+                pixels == size,
+                f"Observation.{name} has {pixels[0]} x {pixels[1]} pixels, its camera {size[0]} x "
+                f"{size[1]} (height, width)",
+            )
 
 
 @record
@@ -282,20 +282,20 @@ def check_channels(observations: Sequence[Observation], channels: int, source: s
     """Raise `ValueError` for a picture of another number of channels than its source has."""
     for i, observation in enumerate(observations):
         count = observation.picture.shape[2]
-        if count != channels:
-            raise ValueError(
-                f"observations[{i}].picture has {count} channels, {source} has {channels}"
-            )
+        require(
+            count == channels,
+            f"observations[{i}].picture has {count} channels, {source} has {channels}",
+        )
 
 
 def check_counted(counted: Sequence[Float[Array, "height width"]]) -> None:
     """Raise `ValueError` for an observation without a pixel that counts."""
     for i, pixels in enumerate(counted):
-        if not np.any(pixels):
-            raise ValueError(
-                f"no pixel of observations[{i}] counts: none is covered by the splats, kept by "
-                "the mask and finite; check camera, mask and NaN"
-            )
+        require(
+            np.any(pixels),
+            f"no pixel of observations[{i}] counts: none is covered by the splats, kept by the "
+            "mask and finite; check camera, mask and NaN",
+        )
 
 
 def compared(

@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from splatjax._format import counted, format_numbers, percent
-from splatjax._records import check_values
+from splatjax._records import check_values, require
 from splatjax.diffusion import ClusterDiffuser
 from splatjax.fitting import (
     AbstractModel,
@@ -116,8 +116,10 @@ def recover(
         jax.tree.map(lambda leaf: leaf.astype(dtype), start)
         for start in ([starts] if isinstance(starts, Medium) else starts)
     ]
-    if not isinstance(model, AbstractModel):
-        raise ValueError(f"model is {model!r}; give TransportModel() or DiffusionModel(profile)")
+    require(
+        isinstance(model, AbstractModel),
+        f"model is {model!r}; give TransportModel() or DiffusionModel(profile)",
+    )
     _check(observations, splats, starts, surface)
     report = progress or (lambda stage, medium: None)
     eta, channels = starts[0].eta, starts[0].channels
@@ -161,9 +163,8 @@ def recover(
         point, cost, steps_taken, converged = search(problem, before)
         steps += int(steps_taken)
         information, unresolved, gaussians, radiance = solution(problem, point)
-        size = point.size
-        chi_squared = cost / max(problem.pixels * channels - size, 1)
-        covariance = inverse(np.asarray(information, np.float64)[:size, :size])
+        chi_squared = cost / max(problem.pixels * channels - point.size, 1)
+        covariance = inverse(np.asarray(information, np.float64)[: point.size, : point.size])
         scale = 1.0 if noise_is_known else float(chi_squared) ** 0.5
         deviations = scale * np.sqrt(np.diagonal(covariance))
         moved = np.abs(point - before)
@@ -205,18 +206,18 @@ def recover(
 
 
 def _check(observations: list[Observation], splats, starts: list[Medium], surface) -> None:
-    if not observations or not starts:
-        raise ValueError(
-            f"at least one observation and one start are needed; got {len(observations)} and "
-            f"{len(starts)}"
-        )
+    require(
+        observations and starts,
+        f"at least one observation and one start are needed; got {len(observations)} and "
+        f"{len(starts)}",
+    )
     eta = starts[0].eta
     for i, start in enumerate(starts):
-        if not np.array_equal(start.eta, eta):
-            raise ValueError(
-                f"starts[{i}].eta is {start.eta.tolist()}, and that of the first "
-                f"{eta.tolist()}; give all the same index"
-            )
+        require(
+            np.array_equal(start.eta, eta),
+            f"starts[{i}].eta is {start.eta.tolist()}, and that of the first {eta.tolist()}; give "
+            "all the same index",
+        )
         check_values(
             f"starts[{i}].sigma_a",
             start.sigma_a,
@@ -290,8 +291,7 @@ def next_pictures(
     **Raises:** `ValueError` for no candidate, and for one in which the body is not visible.
     """
     candidates = list(candidates)
-    if not candidates:
-        raise ValueError("candidates is empty; give some, or default_candidates(splats, camera)")
+    require(candidates, "candidates is empty; give some, or default_candidates(splats, camera)")
     medium, dtype = recovery.medium, recovery.medium.eta.dtype
     pictured_scenes = [PicturedScene(splats, view.camera, view.lights) for view in candidates]
     pictures, _ = render_layers(pictured_scenes, recovery.material, settings)

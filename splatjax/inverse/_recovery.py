@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from splatjax._format import channel_names, percent
+from splatjax._records import require
 from splatjax.fitting import (
     AbstractModel,
     AbstractWeights,
@@ -71,7 +72,7 @@ class AbstractEstimate(eqx.Module):
         return [best_and_worst(covariance) for covariance in self.covariance()]
 
     def summary(self, channels: Sequence[str] | None = None) -> str:
-        """Format the coefficients, their errors, and the combinations that are not fixed.
+        """Format the coefficients, their errors, and what is not determined.
 
         **Arguments:**
 
@@ -79,8 +80,8 @@ class AbstractEstimate(eqx.Module):
         """
         return "\n".join(line for lines in self.lines(channels) for line in lines)
 
-    def lines(self, channels: Sequence[str] | None = None) -> list[list[str]]:
-        """Format each channel, in one line or two."""
+    def lines(self, channels: Sequence[str] | None) -> list[list[str]]:
+        """Format each channel, in a few lines."""
         names = channels or channel_names(self.medium.channels)
         values, errors = (self.medium.sigma_a, self.medium.sigma_s_prime), self.relative_errors()
         lines = []
@@ -250,30 +251,26 @@ class Recovery(AbstractEstimate):
         """
         return Estimate(self.medium, self.covariance(resolution=0.0)).relative_errors()
 
-    def summary(self, channels: Sequence[str] | None = None) -> str:
-        """Format the coefficients, their errors, and what the pictures do not determine.
-
-        **Arguments:**
-
-        - `channels`: their names; by default red, green and blue, or numbers.
-        """
-        summary = []
-        for lines, unresolved in zip(self.lines(channels), self.unresolved.tolist(), strict=True):
-            summary += lines
+    def lines(self, channels: Sequence[str] | None) -> list[list[str]]:
+        lines = super().lines(channels)
+        for of_channel, unresolved in zip(lines, self.unresolved.tolist(), strict=True):
             if unresolved > _MOST:
-                summary.append(
+                of_channel.append(
                     f"  {percent(unresolved)} of its light spreads less than the spacing of "
                     "the splats, so its width is hardly determined; take more splats, or a "
                     "closer picture"
                 )
         if not self.noise_is_known:
-            summary.append("error bars follow from the residuals, with independent pixels")
+            lines.append(["error bars follow from the residuals, with independent pixels"])
         elif float(self.chi_squared) > _TOO_LARGE:
-            summary.append(
-                f"the residuals are {float(self.chi_squared) ** 0.5:.2g} times the noise; the "
-                "model is incomplete, and the error bars are too small"
+            noise = f"{float(self.chi_squared) ** 0.5:.2g} times the noise"
+            lines.append(
+                [
+                    f"the residuals are {noise}; the model is incomplete, and the error bars are "
+                    "too small"
+                ]
             )
-        return "\n".join(summary)
+        return lines
 
 
 def combined(recoveries: Sequence[Recovery]) -> Estimate:
@@ -295,15 +292,14 @@ def combined(recoveries: Sequence[Recovery]) -> Estimate:
 
     **Raises:** `ValueError` for no recovery, and for channels or indices of refraction that differ.
     """
-    if not recoveries:
-        raise ValueError("recoveries is empty; give at least one")
+    require(recoveries, "recoveries is empty; give at least one")
     eta = recoveries[0].medium.eta
     for i, recovery in enumerate(recoveries):
-        if not np.array_equal(recovery.medium.eta, eta):
-            raise ValueError(
-                f"recoveries[{i}].medium.eta is {recovery.medium.eta.tolist()}, and that of "
-                f"the first {eta.tolist()}; combine recoveries of one material"
-            )
+        require(
+            np.array_equal(recovery.medium.eta, eta),
+            f"recoveries[{i}].medium.eta is {recovery.medium.eta.tolist()}, and that of the first "
+            f"{eta.tolist()}; combine recoveries of one material",
+        )
     points = np.log(
         [
             np.stack([recovery.medium.sigma_a, recovery.medium.sigma_s_prime], axis=-1)

@@ -2,7 +2,6 @@
 the normals, and parameters of the material, such as melanin and blood.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -151,8 +150,7 @@ def _slopes(centers: np.ndarray, normals: np.ndarray):
     """
     around = scipy.spatial.KDTree(centers).query(centers, k=_SLOPES, workers=-1)[1][:, 1:]
     tangents = np.stack(tangent_frames(normals), axis=1)
-    offsets = centers[around] - centers[:, None]
-    u, v = np.einsum("nki,nai->ank", offsets, tangents)
+    u, v = np.einsum("nki,nai->ank", centers[around] - centers[:, None], tangents)
     size = np.sqrt(np.mean(u * u + v * v, axis=1, keepdims=True))
     u, v = u / size, v / size
     trust = np.exp(-0.5 * (u * u + v * v)) * (
@@ -247,8 +245,9 @@ class ParameterMap(AbstractPart):
 
     def moved(self, pictured: PicturedScene, x, prepared: MapTables) -> PicturedScene:
         weights = prepared.table.interpolate(self._fractions(x, prepared))
-        splats = dataclasses.replace(pictured.splats, weights=weights)
-        return dataclasses.replace(pictured, splats=splats)
+        return eqx.tree_at(
+            lambda s: s.splats.weights, pictured, weights, is_leaf=lambda leaf: leaf is None
+        )
 
     def prior_residuals(self, x: Float[Array, "splats parameters"], prepared: MapTables):
         return prepared.mean.gain / self.deviation * _changes(x, prepared)
