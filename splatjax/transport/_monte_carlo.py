@@ -123,8 +123,9 @@ def monte_carlo(
     }
     groups, means = _shared_walks(media), []
     for number, group in enumerate(groups):
-        channels = jnp.asarray(group.astype(np.int32))
-        walk = _walk_of(media, jnp.asarray(number), channels, edges, key, **settings)
+        walk = _walk_of(
+            media, jnp.asarray(number), jnp.asarray(group, jnp.int32), edges, key, **settings
+        )
         report = progress and (
             lambda done, before=number: progress(before * photons + done, len(groups) * photons)
         )
@@ -217,5 +218,6 @@ def _walk_of(
         media.g,
         media.first,
     )
-    key = jax.random.fold_in(key, number)
-    return Walk(media=in_free_paths, edges=edges[None] / unit[:, None], key=key, **settings)
+    return Walk(
+        in_free_paths, edges[None] / unit[:, None], jax.random.fold_in(key, number), **settings
+    )

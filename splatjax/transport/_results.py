@@ -156,8 +156,9 @@ def assemble(
     """Turn means of weights and of their squares into results; errors are constants."""
     rings, divisor = edges.shape[0] - 1, (photons - 1).astype(edges.dtype)
     areas = jnp.pi * (edges[1:] ** 2 - edges[:-1] ** 2)
-    borders = [rings + 1, 2 * rings + 2, 2 * rings + 3]
-    above, below, unfinished, absorbed = jnp.split(moments, borders, axis=1)
+    above, below, unfinished, absorbed = jnp.split(
+        moments, [rings + 1, 2 * rings + 2, 2 * rings + 3], axis=1
+    )
 
     def mean(moments: Float[Array, "*shape two"]) -> SampleMean:
         variance = jax.lax.stop_gradient(moments[..., 1] - moments[..., 0] ** 2) / divisor

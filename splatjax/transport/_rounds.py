@@ -232,8 +232,7 @@ def uniforms(
         )[1]
         for word in higher
     ]
-    bits = jnp.concatenate(pairs)
-    return ((bits >> 8) + jnp.uint32(1)).astype(dtype) * 2.0**-24
+    return ((jnp.concatenate(pairs) >> 8) + jnp.uint32(1)).astype(dtype) * 2.0**-24
 
 
 def evenly(key: Key[Array, ""], number: Int[Array, " lanes"], dtype) -> Float[Array, " lanes"]:
