@@ -35,9 +35,8 @@ def invert(matrix: Float[Array, "columns columns"]) -> Float[Array, "columns col
         # The unit vector replaces the column, and becomes the column of the inverse.
         replaced = jnp.where(is_column[None], is_column[:, None].astype(matrix.dtype), matrix)
         row = replaced[column] / matrix[column, column]
-        return jnp.where(
-            is_column[:, None], row[None], replaced - matrix[:, column][:, None] * row[None]
-        )
+        reduced = replaced - matrix[:, column][:, None] * row[None]
+        return jnp.where(is_column[:, None], row[None], reduced)
 
     return jax.lax.fori_loop(0, matrix.shape[0], eliminate, matrix)
 

@@ -230,9 +230,8 @@ def _carried(
 
 
 def _components(cost: np.ndarray, starts: np.ndarray, ends: np.ndarray, count: int) -> np.ndarray:
-    return scipy.sparse.csgraph.connected_components(
-        scipy.sparse.coo_array((cost, (starts, ends)), shape=(count, count)), directed=False
-    )[1]
+    graph = scipy.sparse.coo_array((cost, (starts, ends)), shape=(count, count))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
 
 
 def _turn_cavities(

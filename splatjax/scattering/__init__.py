@@ -37,6 +37,7 @@ from ._quadrature import (
     L2_QUADRATURE as L2_QUADRATURE,
     RadialRule as RadialRule,
 )
+from ._projected import Projected as Projected
 from ._skin import Skin as Skin, SkinProfile as SkinProfile
 from ._slab import (
     AbstractSlabProfile as AbstractSlabProfile,
@@ -47,6 +48,5 @@ from ._slab import (
 from ._tabulated import (
     LaserDot as LaserDot,
     measure_laser_dot as measure_laser_dot,
-    Projected as Projected,
     Tabulated as Tabulated,
 )

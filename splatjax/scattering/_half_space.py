@@ -243,9 +243,10 @@ def _directional_albedo(absorbed, eta, g, cover=None) -> Float[Array, " angles"]
         half_space = back + transmitted @ half_space @ between
     # Adding the surface: by reciprocity, the fraction of light from one direction that leaves
     # equals the fraction of light from all directions that leaves in that direction.
-    return jnp.linalg.solve(
+    leaving = jnp.linalg.solve(
         identity - half_space * reflected[None], half_space @ (1 - reflected)[:, None]
-    )[: _OUTSIDE + 1, 0]
+    )
+    return leaving[: _OUTSIDE + 1, 0]
 
 
 def _doubled(mu, weights, absorbed, g, optical_depth=None):

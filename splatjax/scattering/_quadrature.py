@@ -90,14 +90,18 @@ class RadialRule(AbstractRadialRule):
         return radii, jnp.where(inside, weights * (radii / scale) ** self.tail, 0.0)
 
 
-# For integrals of `r R^2` (Eq. 3 and Eq. 4): the neglected tail of a medium without absorption is
-# 1e-16 of the integral. The squared error of a fit must be accurate, which takes many nodes: with
-# 128, an error of 1e-5 is wrong by a tenth; with 192, by 1e-7.
 L2_QUADRATURE = RadialRule(smallest=1e-3, largest=1e4, count=192)
+"""For integrals of `r R^2` (Eq. 3 and Eq. 4): the neglected tail of a medium without absorption is
+1e-16 of the integral.
 
-# For integrals of `r R`, whose tails are long: without absorption they fall like 1/r, and 1e-7 is
-# neglected.
+The squared error of a fit must be accurate, which takes many nodes: with 128, an error of 1e-5 is
+wrong by a tenth; with 192, by 1e-7.
+"""
+
 L1_QUADRATURE = RadialRule(smallest=1e-3, largest=1e7, count=256)
+"""For integrals of `r R`, whose tails are long: without absorption they fall like 1/r, and 1e-7 is
+neglected.
+"""
 
 
 class InverseVariance(AbstractRadialRule):
@@ -140,10 +144,8 @@ def _nodes(smallest: float, largest: float, count: int, near: int) -> tuple[np.n
     log_nodes, log_weights = unit_legendre(count)
     length = np.log(largest / smallest)
     radii = smallest * np.exp(length * log_nodes)
-    return (
-        np.concatenate([smallest * near_nodes, radii]),
-        np.concatenate([smallest * near_weights, length * radii * log_weights]),
-    )
+    nodes = np.concatenate([smallest * near_nodes, radii])
+    return nodes, np.concatenate([smallest * near_weights, length * radii * log_weights])
 
 
 @functools.cache

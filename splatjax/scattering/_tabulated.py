@@ -1,17 +1,12 @@
-"""Profiles made of others: from tables, from photographs of a laser dot, and colors of profiles by
-wavelength.
-"""
-
-from typing import ClassVar
+"""Measured profiles: from tables, and from photographs of a laser dot."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import Numbers, check_values, numbers, record, require, valid
+from splatjax._records import Numbers, check_values, numbers, record, valid
 from splatjax.gaussians import AbstractProfile
 
 # Fraction of the peak above which pixels determine the center.
@@ -75,13 +70,11 @@ class Tabulated(AbstractProfile):
     def without(self, profile: AbstractProfile) -> "Tabulated":
         """Subtract a profile, such as single scattering, to fit the rest."""
         if profile.singular:
-            check_values(
-                "Tabulated.radii",
-                self.radii,
+            requirement = (
                 f"above 0, because {type(profile).__name__} is infinite at r = 0; leave that "
-                "row out",
-                lambda x: x > 0,
+                "row out"
             )
+            check_values("Tabulated.radii", self.radii, requirement, lambda x: x > 0)
         total = None if self.total is None else self.total - profile.total_reflectance()
         return Tabulated(self.radii, self.values - profile(self.radii), self.deviation, total)
 
@@ -114,47 +107,6 @@ class Tabulated(AbstractProfile):
         steps = jnp.diff(self.radii)
         weights = 0.5 * (jnp.append(steps, 0.0) + jnp.insert(steps, 0, self.radii[0]))
         return self.radii, weights
-
-
-@record
-class Projected(AbstractProfile):
-    r"""A profile by wavelength, converted to red, green and blue by a matrix.
-
-    Converting the profile instead of the picture is exact only if light and albedo are the same at
-    all wavelengths, and the kernel of pass 4 has gain 1 (`diffusion.PlainMean`, or flat surfaces).
-    With `EscapeNormalization` the gain on a curved body differs by wavelength: render the
-    wavelengths, and convert the picture.
-
-    **Attributes:** (differentiable)
-
-    - `profile`: a profile of as many channels as the matrix has rows.
-    - `matrix`: as `io.spectrum_to_rgb` computes it.
-
-    **Raises:** `ValueError` for a matrix of another number of rows.
-    """
-
-    profile: AbstractProfile
-    matrix: Float[Array, "wavelengths colors"] = eqx.field(converter=numbers)
-
-    singular: ClassVar[bool] = True
-
-    def __check_init__(self):
-        rows, channels = len(self.matrix), len(jax.eval_shape(self.profile.length_scale))
-        require(
-            rows == channels,
-            f"Projected.matrix has {rows} rows, and Projected.profile has {channels} channels; "
-            "give a row for each",
-        )
-
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        return jnp.dot(self.profile(r), self.matrix)
-
-    def total_reflectance(self) -> Float[Array, " channels"]:
-        return self.profile.total_reflectance() @ self.matrix
-
-    def length_scale(self) -> Float[Array, " channels"]:
-        share = jnp.abs(self.matrix)
-        return self.profile.length_scale() @ (share / jnp.sum(share, axis=0, keepdims=True))
 
 
 class LaserDot(eqx.Module):
@@ -221,9 +173,10 @@ def measure_laser_dot(
     centroid = [float((core * coordinate).sum() / core.sum()) for coordinate in (x, y)]
     x0, y0 = centroid if center is None else center
     inside = min(x0, y0, width - x0, height - y0)
-    require(
-        inside > 0, f"center {x0:g}, {y0:g} is outside of the picture of {width} x {height} pixels"
-    )
+    if not inside > 0:
+        raise ValueError(
+            f"center {x0:g}, {y0:g} is outside of the picture of {width} x {height} pixels"
+        )
     radius = np.hypot(x - x0, y - y0)
     last = inside if largest is None else min(largest / mm_per_pixel, inside)
     within = radius <= last
@@ -252,8 +205,9 @@ def _rings(radius: np.ndarray, step: float) -> list[np.ndarray]:
     scatter are joined.
     """
     order = np.argsort(radius, kind="stable")
+    edges = np.searchsorted(radius[order], np.arange(step, radius.max() + step, step))
     rings, begin = [], 0
-    for end in np.searchsorted(radius[order], np.arange(step, radius.max() + step, step)):
+    for end in edges:
         if end - begin >= _LEAST_PIXELS:
             rings.append(order[begin:end])
             begin = end
