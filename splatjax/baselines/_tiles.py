@@ -18,15 +18,16 @@ from splatjax.splatting import (
     AbstractRasterizer,
     AbstractRasterPlan,
     AbstractView,
-    BinCapacity,
     Bins,
     Footprints,
     FragmentSums,
     PixelSums,
     SplattingSettings,
     TileGrid,
+    TileRanges,
     TileRasterizer,
     bin_items,
+    plan_pairs,
 )
 
 from ._kernels import AbstractSplatKernel
@@ -51,7 +52,7 @@ class AbstractListRasterizer(AbstractRasterizer):
         # Blocks of the longest list of each chunk; every list of the chunk takes as many.
         longest = [np.sort(grid.blocks(tiles))[::-1][:: grid.lanes] for tiles in counts]
         blocks = with_spare(("blocks", grid), max(int(chunks.sum()) for chunks in longest), 4)
-        return ListPlan(self, BinCapacity.for_counts(counts, grid), blocks)
+        return ListPlan(self, plan_pairs(counts, grid), blocks)
 
     def for_shadows(self) -> AbstractRasterizer:
         return TileRasterizer()
@@ -71,7 +72,7 @@ class ListPlan(AbstractRasterPlan):
     """
 
     rasterizer: AbstractListRasterizer
-    capacity: BinCapacity
+    pairs: int = eqx.field(static=True)
     blocks: int = eqx.field(static=True)
 
     def sum_fragments(
@@ -84,7 +85,8 @@ class ListPlan(AbstractRasterPlan):
     ) -> FragmentSums:
         grid = TileGrid(view.width, view.height)
         footprints = self.rasterizer.kernel.footprints(splats, view, settings)
-        bins = bin_items(footprints.ranges(grid), grid, self.capacity)
+        ranges = TileRanges.of(footprints.box, footprints.visible, grid)
+        bins = bin_items(ranges, grid, self.pairs)
         lengths = grid.blocks(bins.counts[bins.order[:: grid.lanes]])
         ends = jnp.concatenate([running(jnp.add, lengths), jnp.full(1, self.blocks, jnp.int32)])
         block = jnp.arange(self.blocks, dtype=jnp.int32)
@@ -156,4 +158,5 @@ def _demand(
     kernel: AbstractSplatKernel, splats: Splats, view: AbstractView, settings: SplattingSettings
 ):
     grid = TileGrid(view.width, view.height)
-    return kernel.footprints(splats, view, settings).ranges(grid).per_tile(grid)
+    footprints = kernel.footprints(splats, view, settings)
+    return TileRanges.of(footprints.box, footprints.visible, grid).per_tile(grid)

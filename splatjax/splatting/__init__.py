@@ -4,8 +4,8 @@ scattering.
 
 from ._bins import (
     bin_items as bin_items,
-    BinCapacity as BinCapacity,
     Bins as Bins,
+    plan_pairs as plan_pairs,
 )
 from ._dense import DenseRasterizer as DenseRasterizer
 from ._views import (

@@ -1,8 +1,8 @@
 """Lists of items per tile of the picture.
 
 Tiles are swept `lanes` at a time, those with lists of similar length together, and `slots` items of
-each list at a time, a *block*. No item is dropped: the only limits are the planned numbers of pairs
-and of tiles with any item, and exceeding either is reported.
+each list at a time, a *block*. No item is dropped: the only limit is the planned number of pairs of
+item and tile, and exceeding it is reported.
 """
 
 from collections.abc import Sequence
@@ -21,25 +21,12 @@ _ROW_BITS = 32 - TILE_BITS  # of a sort key: the number of a pair in its row
 _ROW = 1 << _ROW_BITS  # pairs sorted together
 
 
-class BinCapacity(eqx.Module):
-    """Capacity of the lists: pairs of item and tile, and chunks with any item. Static."""
-
-    pairs: int = eqx.field(static=True)
-    chunks: int = eqx.field(static=True)
-
-    @classmethod
-    def for_counts(
-        cls, per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid, spare: float = 1.03
-    ) -> "BinCapacity":
-        """Choose the capacity for each of these numbers of items per tile."""
-        counts = [np.asarray(tiles, np.int64) for tiles in per_tile]
-        pairs = max(int(tiles.sum()) for tiles in counts)
-        chunks = max(-(-int((tiles > 0).sum()) // grid.lanes) for tiles in counts)
-        chunks = with_spare(("chunks", grid), chunks, -(-grid.half // 2), spare=spare)
-        return cls(
-            with_spare(("pairs", grid), max(pairs, 1), _ROW, per_octave=2, spare=spare),
-            min(max(chunks, grid.half), grid.padded_count // grid.lanes),
-        )
+def plan_pairs(
+    per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid, spare: float = 1.03
+) -> int:
+    """Choose the capacity of pairs of item and tile for each of these numbers of items per tile."""
+    pairs = max(int(np.asarray(tiles, np.int64).sum()) for tiles in per_tile)
+    return with_spare(("pairs", grid), max(pairs, 1), _ROW, per_octave=2, spare=spare)
 
 
 class Bins(eqx.Module):
@@ -132,24 +119,22 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
     return sorted_tile, column_before, rank, counts
 
 
-def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins:
-    """List the items of every tile, in order. Not differentiated."""
+def bin_items(ranges: TileRanges, grid: TileGrid, pairs: int) -> Bins:
+    """List the items of every tile, in order, with a capacity of pairs. Not differentiated."""
     items, tiles = ranges.left.shape[0], grid.padded_count
     # List the pairs item after item, and number the pairs of each tile.
-    item, tile, needed = _pairs(ranges, grid, capacity.pairs)
+    item, tile, needed = _pairs(ranges, grid, pairs)
     tile, column, rank, counts = _ranks(tile, tiles)
     item = jnp.take_along_axis(item.reshape(-1, _ROW), column, axis=1, mode="promise_in_bounds")
 
     # Tile after tile. Empty pairs, whose tile is the one after the last, come after all others.
     begins = running(jnp.add, counts) - counts
     place = begins.at[tile].get(mode="promise_in_bounds") + rank
-    ids = jnp.full(capacity.pairs, items, jnp.int32)
+    ids = jnp.full(pairs, items, jnp.int32)
     ids = ids.at[place.reshape(-1)].set(item.reshape(-1), mode="drop")
 
     # Longest lists first; of equally many blocks in scan order, so that the lanes of a chunk are
     # neighbors.
     counts = counts.at[tiles].set(0)
-    blocks = grid.blocks(counts[:tiles])
-    order = jnp.argsort(-blocks, stable=True).astype(jnp.int32)
-    occupied = needed_over_planned(jnp.sum(blocks > 0), capacity.chunks * grid.lanes)
-    return Bins(ids, begins, counts, order, jnp.max(jnp.stack([needed, occupied])), items)
+    order = jnp.argsort(-grid.blocks(counts[:tiles]), stable=True).astype(jnp.int32)
+    return Bins(ids, begins, counts, order, needed, items)

@@ -108,16 +108,23 @@ class TileRanges(eqx.Module):
     @classmethod
     def of(
         cls,
-        left: Float[Array, " items"],
-        right: Float[Array, " items"],
-        top: Float[Array, " items"],
-        bottom: Float[Array, " items"],
+        box: tuple[Float[Array, " items"], ...],
         visible: Bool[Array, " items"],
         grid: TileGrid,
     ) -> "TileRanges":
-        """Find the tiles with a pixel center inside each box (pixels)."""
-        i0, i1 = (pixel / TILE_SIDE for pixel in _between(left, right, grid.width))
-        j0, j1 = (pixel / TILE_SIDE for pixel in _between(top, bottom, grid.height))
+        """Find the tiles with a pixel center inside each box: left, right, top and bottom, pixels.
+
+        The last pixel is before the first where there is none.
+        """
+        left, right, top, bottom = box
+        i0, j0 = (
+            jnp.clip(jnp.ceil(edge - 0.5), 0, count) / TILE_SIDE
+            for edge, count in ((left, grid.width), (top, grid.height))
+        )
+        i1, j1 = (
+            jnp.clip(jnp.floor(edge - 0.5), -1, count - 1) / TILE_SIDE
+            for edge, count in ((right, grid.width), (bottom, grid.height))
+        )
         touched = visible & (i0 <= i1) & (j0 <= j1)
         i0, i1, j0, j1 = (jnp.floor(edge).astype(jnp.int32) for edge in (i0, i1, j0, j1))
         return cls(i0, j0, jnp.where(touched, i1 - i0 + 1, 0), jnp.where(touched, j1 - j0 + 1, 0))
@@ -131,13 +138,3 @@ class TileRanges(eqx.Module):
         corners = corners.at[self.top, right].add(-touched).at[below, self.left].add(-touched)
         counts = jnp.cumsum(jnp.cumsum(corners, axis=0), axis=1)[:-1, :-1].reshape(-1)
         return jnp.pad(counts, (0, grid.padded_count - counts.shape[0]))
-
-
-def _between(
-    low: Float[Array, " items"], high: Float[Array, " items"], count: int
-) -> tuple[Float[Array, " items"], Float[Array, " items"]]:
-    """Return the first and the last of `count` pixels with centers between two edges; the last is
-    before the first if there is none.
-    """
-    first = jnp.clip(jnp.ceil(low - 0.5), 0, count)
-    return first, jnp.clip(jnp.floor(high - 0.5), -1, count - 1)

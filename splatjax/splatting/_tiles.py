@@ -17,14 +17,14 @@ from splatjax._chunking import (
     take_points,
     with_spare,
 )
-from splatjax._combination import AbstractCombination, DeviceMesh
+from splatjax._combination import DeviceMesh
 from splatjax._precision import full_precision
 from splatjax.cache import reuse_capacity
 from splatjax.scene import Splats
 
-from ._bins import BinCapacity, bin_items
+from ._bins import bin_items, plan_pairs
 from ._fragments import NUMBERS, PartSweep
-from ._grid import TileGrid
+from ._grid import TileGrid, TileRanges
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, SurfaceCapacity
 from ._sweeps import sum_tile_fragments
 from ._views import AbstractView, SplattingSettings
@@ -56,40 +56,43 @@ class TileRasterizer(AbstractRasterizer):
         self, parts: Sequence[Splats], views: Sequence[AbstractView], settings: SplattingSettings
     ) -> "TilePlan":
         demands = [[self.demand(part, view, settings) for view in views] for part in parts]
-        return self.plan_for(demands, parts[0].count, views[0])
+        return self.plan_for(demands, parts[0].count, views[0], len(parts))
 
     @eqx.filter_jit
     def demand(
         self, splats: Splats, view: AbstractView, settings: SplattingSettings
     ) -> tuple[Array, Int[Array, " tiles"]]:
         """Count the splats that may be visible, and the splats of every tile."""
-        ranges = view.footprints(splats, settings).ranges(self.grid(view))
-        return jnp.sum(view.may_see(splats)), ranges.per_tile(self.grid(view))
+        footprints, grid = view.footprints(splats, settings), self.grid(view)
+        ranges = TileRanges.of(footprints.box, footprints.visible, grid)
+        return jnp.sum(view.may_see(splats)), ranges.per_tile(grid)
 
     def plan_for(
         self,
         demands: Sequence[Sequence[tuple[Array, Int[Array, " tiles"]]]],
         splats: int,
         view: AbstractView,
+        devices: int = 1,
     ) -> "TilePlan":
-        """Make the plan for the demand of each part in each view, of so many splats at most."""
+        """Make the plan for the demand of each part in each view, of so many splats at most. Every
+        device has a share of the places.
+        """
         grid = self.grid(view)
-        step = max(_STEP, splats // 8)
         most = max(int(seen) for part in demands for seen, _ in part)
-        seen = with_spare(("seen", splats), most, step, spare=self.spare)
-        bins = BinCapacity.for_counts(
-            [tiles for part in demands for _, tiles in part], grid, self.spare
-        )
-        front = bins.chunks * self.lanes
-        if len(demands) > 1:
-            # Places are shared by the parts: there is one for each tile that any part touches.
-            touched = [
-                np.any([np.asarray(tiles) > 0 for _, tiles in of_view], axis=0)
-                for of_view in zip(*demands, strict=True)
-            ]
-            grain = math.lcm(self.lanes, len(demands))
-            front = with_spare(("front", grid), max(int(np.sum(tiles)) for tiles in touched), grain)
-        return TilePlan(self, min(seen, splats), bins, SurfaceCapacity(front, front))
+        seen = with_spare(("seen", splats), most, max(_STEP, splats // 8), spare=self.spare)
+        pairs = plan_pairs([tiles for part in demands for _, tiles in part], grid, self.spare)
+        # There is a place for each tile that any part touches.
+        touched = [
+            np.any([np.asarray(tiles) > 0 for _, tiles in of_view], axis=0)
+            for of_view in zip(*demands, strict=True)
+        ]
+        most = max(int(np.sum(tiles)) for tiles in touched)
+        step = self.lanes * -(-grid.half // 2)
+        front = with_spare(("front", grid), most, step, spare=self.spare)
+        grain = math.lcm(self.lanes, devices)
+        front = min(max(front, self.lanes * grid.half), grid.padded_count)
+        front = -(-front // grain) * grain
+        return TilePlan(self, min(seen, splats), pairs, SurfaceCapacity(front, front))
 
     def grid(self, view: AbstractView) -> TileGrid:
         """Cut the picture of a view into tiles."""
@@ -103,13 +106,13 @@ class TilePlan(AbstractRasterPlan):
 
     - `rasterizer`: the rasterizer that made the plan.
     - `splats`: number of splats that may be visible.
-    - `bins`: capacity of the lists.
+    - `pairs`: capacity of the lists: pairs of splat and tile.
     - `places`: capacity for the tiles with a surface.
     """
 
     rasterizer: TileRasterizer
     splats: int = eqx.field(static=True)
-    bins: BinCapacity
+    pairs: int = eqx.field(static=True)
     places: SurfaceCapacity
 
     def fitted(
@@ -121,10 +124,9 @@ class TilePlan(AbstractRasterPlan):
             plan = self.rasterizer.make_plan([joined], views, settings)
         # Coarse capacities, so that other bodies and pictures of the size share the program.
         grid = self.rasterizer.grid(views[0])
-        bins = BinCapacity(1 << plan.bins.pairs.bit_length(), grid.padded_count // grid.lanes)
         every_tile = SurfaceCapacity(grid.padded_count, grid.padded_count)
         seen = min(1 << plan.splats.bit_length(), joined.count)
-        coarse = TilePlan(self.rasterizer, seen, bins, every_tile)
+        coarse = TilePlan(self.rasterizer, seen, 1 << plan.pairs.bit_length(), every_tile)
         most = max(int(_tiles_behind(joined, view, settings, coarse)) for view in views)
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
@@ -145,7 +147,7 @@ class TilePlan(AbstractRasterPlan):
         attributes: Float[Array, "attributes splats"],
         view: AbstractView,
         settings: SplattingSettings,
-        combination: AbstractCombination,
+        combination: DeviceMesh,
     ) -> FragmentSums:
         sweep_settings, *binned = self._bin(splats, attributes, view, settings)
         return sum_tile_fragments(sweep_settings, self.places, combination, *binned)
@@ -173,7 +175,7 @@ class TilePlan(AbstractRasterPlan):
         return (
             (type(view), grid, settings.filter_radius),
             settings.hidden_from.astype(splats.centers.dtype),
-            bin_items(footprints.ranges(grid), grid, self.bins),
+            bin_items(TileRanges.of(footprints.box, footprints.visible, grid), grid, self.pairs),
             jax.lax.stop_gradient(footprints.shift),
             tuple(getattr(footprints, name) for name in NUMBERS),
             attributes,

@@ -18,7 +18,6 @@ from random_bodies import KINDS, disagreement, random_body, seeds
 
 from splatjax._combination import DeviceMesh
 from splatjax.splatting import (
-    BinCapacity,
     DenseRasterizer,
     SplattingSettings,
     TileGrid,
@@ -26,6 +25,7 @@ from splatjax.splatting import (
     TileRasterizer,
     bin_items,
     make_shadow_map,
+    plan_pairs,
 )
 from splatjax.splatting._rasterizer import may_show_behind
 
@@ -165,7 +165,7 @@ def test_too_small_a_capacity_makes_the_picture_nan_and_is_reported():
     plan = whole.fitted([body], [view], SETTINGS)
     assert plan.places.behind < whole.places.behind
     few = dataclasses.replace(plan.places, behind=2)
-    for short in ({}, {"splats": 100}, {"bins": BinCapacity(1024, 4)}, {"places": few}):
+    for short in ({}, {"splats": 100}, {"pairs": 1024}, {"places": few}):
         tried = dataclasses.replace(plan, **short)
         make = jax.jit(make_shadow_map, static_argnums=(2, 3, 4))
         seen = make(body, view, SETTINGS, tried, DeviceMesh())
@@ -173,7 +173,7 @@ def test_too_small_a_capacity_makes_the_picture_nan_and_is_reported():
         assert np.all(np.isnan(seen.planes) == bool(short)), short
 
 
-@pytest.mark.parametrize("short", [{}, {"pairs": 1024}, {"chunks": 1}], ids=str)
+@pytest.mark.parametrize("short", [False, True])
 def test_too_small_a_capacity_is_reported(short):
     """Of boxes from a tenth of a pixel to without end."""
     grid, rng, count = TileGrid(61, 45, lanes=4, slots=4), np.random.default_rng(11), 900
@@ -181,11 +181,10 @@ def test_too_small_a_capacity_is_reported(short):
     half = np.exp(rng.uniform(np.log(0.1), np.log(30.0), (2, count)))
     half = np.where(rng.uniform(size=half.shape) < 0.05, np.inf, half)
     sides = jnp.asarray(np.stack([middle - half, middle + half], axis=1).reshape(4, count))
-    ranges = TileRanges.of(*sides, jnp.asarray(rng.uniform(size=count) < 0.9), grid)
-    capacity = BinCapacity.for_counts([ranges.per_tile(grid)], grid)
-    tried = dataclasses.replace(capacity, **short)
-    needed = jax.jit(lambda ranges: bin_items(ranges, grid, tried).needed)(ranges)
-    assert (float(needed) > 1) == bool(short)
+    ranges = TileRanges.of(tuple(sides), jnp.asarray(rng.uniform(size=count) < 0.9), grid)
+    pairs = 1024 if short else plan_pairs([ranges.per_tile(grid)], grid)
+    needed = jax.jit(lambda ranges: bin_items(ranges, grid, pairs).needed)(ranges)
+    assert (float(needed) > 1) == short
 
 
 def test_long_lists_in_a_large_picture_keep_all_items():
@@ -194,8 +193,8 @@ def test_long_lists_in_a_large_picture_keep_all_items():
     tiles = jnp.repeat(jnp.arange(4, dtype=jnp.int32), jnp.asarray(counts))
     one = jnp.ones_like(tiles)
     ranges = TileRanges(tiles, 0 * one, one, one)
-    capacity = BinCapacity.for_counts([jnp.asarray(counts)], grid)
-    bins = jax.jit(lambda ranges: bin_items(ranges, grid, capacity))(ranges)
+    pairs = plan_pairs([jnp.asarray(counts)], grid)
+    bins = jax.jit(lambda ranges: bin_items(ranges, grid, pairs))(ranges)
     assert float(bins.needed) <= 1
     for tile, count in enumerate(counts):
         ids = np.asarray(bins.block(jnp.asarray([tile]), jnp.asarray(0), count + 1))
