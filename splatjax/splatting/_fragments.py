@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -154,8 +155,8 @@ class PartSweep(eqx.Module):
         """Return `[lanes, slots, rows]`: attributes, the plane of nearness over the tile (three
         rows) and 1.
         """
-        x, y, sx, sy, _, _, _, e, _, _ = splats
-        nearness = jnp.stack([e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=2)
+        _, plane = _polynomials(*splats[:8])
+        nearness = jnp.stack([*plane, jnp.ones_like(plane[0])], axis=2)
         attributes = self.attributes.at[ids].get(mode="fill", fill_value=0)
         return jnp.concatenate([attributes, nearness], axis=2)
 
@@ -212,11 +213,11 @@ class PartSweep(eqx.Module):
                 nearness, squared_radius, d_squared
             )
             # Both are polynomials in the pixel: their moments over the tile suffice.
-            quad = jnp.moveaxis(d_quadric @ monomials, 2, 0)
-            near = jnp.moveaxis(d_nearness @ monomials[:, :3], 2, 0)
             d_rows = d_rows * opacity[:, :, None]
-            near = near + jnp.moveaxis(d_rows[:, :, count : count + 3], 2, 0)
-            d_numbers = jnp.stack([*_number_cotangents(splats, quad, near), d_opacity], axis=2)
+            near = d_nearness @ monomials[:, :3] + d_rows[:, :, count : count + 3]
+            moments = tuple(tuple(jnp.moveaxis(x, 2, 0)) for x in (d_quadric @ monomials, near))
+            _, pull = jax.vjp(_polynomials, *splats[:8])
+            d_numbers = jnp.stack([*pull(moments), d_opacity], axis=2)
             d_splats = jnp.concatenate([d_numbers, d_rows[:, :, :count]], axis=2)
             return gradients.at[ids].add(d_splats, mode="promise_in_bounds")
 
@@ -231,15 +232,8 @@ def _pixels(dtype) -> tuple[np.ndarray, np.ndarray]:
     return np.tile(side, TILE_SIDE), np.repeat(side, TILE_SIDE)
 
 
-def _number_cotangents(splats, quad, near):
-    """Convert moments of the cotangents over the pixels to cotangents of a splat's numbers."""
-    x, y, sx, sy, a, b, c, _, _, _ = splats
-    m, mx, my, mxx, mxy, myy = quad
-    n, nx, ny = near
-    dx, dy = mx - x * m, my - y * m
-    dxx = mxx - 2 * x * mx + x * x * m
-    dxy = mxy - x * my - y * mx + x * y * m
-    dyy = myy - 2 * y * my + y * y * m
-    d_x = -(2 * a * dx + b * dy + sx * n)
-    d_y = -(b * dx + 2 * c * dy + sy * n)
-    return d_x, d_y, nx - x * n, ny - y * n, dxx, dxy, dyy, n
+def _polynomials(x, y, sx, sy, a, b, c, e):
+    """Expand the quadric of splats in 1, x, y, x^2, xy, y^2 of a pixel, and nearness in 1, x, y."""
+    constant = a * x * x + b * x * y + c * y * y
+    quadric = constant, -2 * a * x - b * y, -b * x - 2 * c * y, a, b, c
+    return quadric, (e - sx * x - sy * y, sx, sy)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._combination import AbstractCombination
+from splatjax._combination import DeviceMesh
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats
 
@@ -62,10 +62,7 @@ def fast_fragment_weight(squared_radius: Float[Array, "..."]) -> Float[Array, ".
     """
     if squared_radius.dtype != jnp.float32:
         return jnp.where(squared_radius < 1, fragment_weight(squared_radius), 0.0)
-    root = _ROOT[0]
-    for coefficient in _ROOT[1:]:
-        root = root * squared_radius + coefficient
-    root = root * (1 - squared_radius)
+    root = jnp.polyval(jnp.asarray(_ROOT, jnp.float32), squared_radius) * (1 - squared_radius)
     return root * root
 
 
@@ -176,7 +173,7 @@ class AbstractRasterPlan(eqx.Module):
         attributes: Float[Array, "attributes splats"],
         view: AbstractView,
         settings: SplattingSettings,
-        combination: AbstractCombination,
+        combination: DeviceMesh,
     ) -> FragmentSums:
         r"""Sum attributes and nearness over the fragments of every pixel (passes 2 and 3).
 
