@@ -11,11 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, DTypeLike, Float, Int, PyTree, Shaped
 
-from splatjax._precision import full_precision
+from splatjax._precision import Function, full_precision
 from splatjax.cache import reuse_capacity
 
 Result = TypeVar("Result", bound=PyTree)
-Function = TypeVar("Function", bound=Callable)
 
 AT_ONCE = 1 << 16
 _LEAST_SPARE = 1.1
@@ -102,9 +101,11 @@ def take_rows(
 
 
 def take_points(
-    rows: Shaped[Array, "*rows points"], chosen: Int[Array, " chosen"]
+    rows: Shaped[Array, "*rows points"], chosen: Int[Array, " chosen"] | None
 ) -> Shaped[Array, "*rows chosen"]:
-    """Take points likewise, along the last axis."""
+    """Take points likewise, along the last axis; all for `None`."""
+    if chosen is None:
+        return rows
     if rows.size == 0:
         return jnp.zeros((*rows.shape[:-1], len(chosen)), rows.dtype)
     # Row by row, so that derivatives are planes too, put together once: that of slices is a sum.

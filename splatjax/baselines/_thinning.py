@@ -59,7 +59,7 @@ class ThinnedPlan(AbstractDiffusionPlan):
         kept = jax.tree.map(lambda rows: rows[..., chosen], everywhere)
         stands_for = combination.total([jnp.sum(sources.areas)]) / jnp.sum(kept.areas)
         kept = dataclasses.replace(kept, areas=kept.areas * stands_for)
-        points = sources.centers if at is None else take_points(sources.centers, at)
+        points = take_points(sources.centers, at)
         layers = dense_layers(kept, points, self.variances_of_layers(variances), kernel)
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))
 

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import jit_unless_traced, take_points
-from splatjax._combination import AbstractCombination
+from splatjax._combination import DeviceMesh
 from splatjax.scene import Splats
 
-from ._clusters import POINTS_PER_BLOCK, SOURCES_PER_BLOCK, LayerSources, SunkSources
+from ._clusters import POINTS_PER_BLOCK, SOURCES_PER_BLOCK, LayerSources
 from ._diffuser import (
     AbstractDiffuser,
     AbstractDiffusionPlan,
@@ -24,7 +24,7 @@ from ._diffuser import (
 )
 from ._gaussian_sums import SourceTable, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
-from ._neighbors import Boxes, Lists, Neighbors, find_neighbors
+from ._neighbors import Boxes, Lists, find_neighbors
 
 # Quantile of the areas of the splats: a layer is resolved as far as splats of that area resolve it.
 FINE_QUANTILE = 0.01
@@ -82,7 +82,10 @@ class ClusterDiffuser(AbstractDiffuser):
             gaussians=jnp.asarray(gaussians, jnp.int32),
             sources=clusters,
             kernels=kernel.truncated(supports),
-            neighbors=Neighbors(lists, points, boxes, clusters.layers, endless),
+            lists=lists,
+            point_boxes=points,
+            source_boxes=boxes,
+            reaches=endless,
             variances=variances,
             margin=jnp.asarray(self.margin, variances.dtype),
         )
@@ -126,25 +129,31 @@ class ClusterPlan(AbstractDiffusionPlan):
 
     - `sources`: the sources of every layer: splats, or clusters of splats.
     - `kernels`: the kernel of every layer.
+    - `lists`: the blocks of sources within reach of every block of points.
+    - `point_boxes`, `source_boxes`, `reaches`: for which they were found: boxes of the points and
+      of the sources, and the reach of each layer, mm.
     - `variances`, `margin`: the plan is valid for variances (mm^2) within the factor `margin` of
       `variances`, or of the first of them.
     """
 
     sources: LayerSources
     kernels: TruncatedGaussian
-    neighbors: Neighbors
+    lists: Lists
+    point_boxes: Boxes
+    source_boxes: Boxes
+    reaches: Float[Array, " layers"]
     variances: Float[Array, " gaussians"]
     margin: Float[Array, ""]
 
     def shares(self):
-        return tuple(jax.tree.leaves((self.neighbors.lists, self.neighbors.points)))
+        return tuple(jax.tree.leaves((self.lists, self.point_boxes)))
 
     def diffuse(
         self,
         sources: Sources,
         variances: Float[Array, " gaussians"],
         kernel: AbstractDiffusionKernel,
-        combination: AbstractCombination,
+        combination: DeviceMesh,
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
         # Every device gathers the sources of all, and evaluates the layers at its own splats.
@@ -161,14 +170,14 @@ class ClusterPlan(AbstractDiffusionPlan):
             points.reshape(3, -1, POINTS_PER_BLOCK).swapaxes(0, 1),
             below,
             self.sources.layers,
-            self.neighbors.lists,
+            self.lists,
             layer_variances,
             self.kernels,
             at,
             forward_mode=self.forward_mode,
         )
         per_mm = units_per_mm(layer_variances)[:, None]
-        seen = points if at is None else take_points(points, at)
+        seen = take_points(points, at)
         layers = jax.checkpoint(layer_values)(  # keeps the sums alone for the derivative
             sums.reshape(len(layer_variances), -1, 4, seen.shape[1]),
             per_mm[:, None] * seen[None],
@@ -177,20 +186,24 @@ class ClusterPlan(AbstractDiffusionPlan):
         )
 
         # The needed over the planned capacity.
-        around = _target_boxes(points, sources.areas), source_boxes(below)
+        moved = source_boxes(below).beyond(self.source_boxes)
+        moved = jax.ops.segment_max(moved, self.sources.layers, len(self.reaches))
+        points_moved = _target_boxes(points, sources.areas).beyond(self.point_boxes)
+        moved = jnp.maximum(moved, 0) + jnp.max(points_moved, initial=0)
         largest = self.kernels.largest.astype(layer_variances.dtype)
         reaches = jnp.sqrt(2 * largest * jax.lax.stop_gradient(layer_variances))
         planned = self.variances[: len(variances)]
         varied = jnp.max(jnp.maximum(planned / variances, variances / planned), initial=0)
         varied = varied / (self.margin * (1 + 1e-6))
-        needed = jnp.maximum(varied, self.neighbors.needed(*around, reaches))
+        missing = jnp.max((reaches + math.sqrt(3) * moved) / self.reaches)
+        needed = jnp.maximum(varied, missing)
         return Diffused(layers, combination.largest([needed.astype(variances.dtype)]))
 
 
 @jit_unless_traced
 def layer_sums(
     points: Float[Array, "blocks 3 block"],
-    below: SunkSources,
+    below: Sources,
     layers: Int[Array, " source_blocks"],
     lists: Lists,
     variances: Float[Array, " layers"],
@@ -253,6 +266,6 @@ def _enclose(
 
 
 @eqx.filter_jit
-def source_boxes(below: SunkSources) -> Boxes:
+def source_boxes(below: Sources) -> Boxes:
     """Enclose the sources of layers below their splats. Not differentiated."""
     return Boxes.around(below.centers, below.areas > 0, SOURCES_PER_BLOCK)

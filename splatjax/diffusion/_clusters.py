@@ -20,16 +20,6 @@ SOURCES_PER_BLOCK = 8
 _TOGETHER = 128 * POINTS_PER_BLOCK  # size of parts that are then halved together
 
 
-class SunkSources(eqx.Module):
-    """The sources of all layers: area-weighted means over their splats below the surface, and the
-    total areas, 0 without splats.
-    """
-
-    centers: Float[Array, "3 sources"]
-    areas: Float[Array, " sources"]
-    irradiance: Float[Array, "channels sources"]
-
-
 class LayerSources(eqx.Module):
     """The sources of every layer: its splats below the surface, or clusters of them.
 
@@ -80,9 +70,11 @@ class LayerSources(eqx.Module):
         return cls(jnp.asarray(parents, jnp.int32), jnp.asarray(layers, jnp.int32))
 
     @jit_unless_traced
-    def merged(self, splats: Sources, depths: Float[Array, " layers"]) -> SunkSources:
+    def merged(self, splats: Sources, depths: Float[Array, " layers"]) -> Sources:
         """Sink the splats below the surface by the depth of each layer, mm, and merge them. Area
         and energy are kept. Differentiable.
+
+        **Returns:** area-weighted means, and the total areas, 0 without splats.
         """
 
         own_light = splats.irradiance.ndim == 3
@@ -103,7 +95,7 @@ class LayerSources(eqx.Module):
         (areas, *rows), _ = jax.lax.scan(add_layer, start, (self.parents, depths, light))
         inverse = 1 / jnp.where(areas > 0, areas, 1.0)
         means = jnp.stack(rows) * inverse[None]
-        return SunkSources(centers=means[:3], areas=areas, irradiance=means[3:])
+        return Sources(means[:3], None, areas, means[3:])
 
 
 def nested_cells(

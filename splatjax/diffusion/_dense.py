@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import map_chunks, take_points
-from splatjax._combination import AbstractCombination
+from splatjax._combination import DeviceMesh
 
 from ._diffuser import (
     AbstractDiffuser,
@@ -39,11 +39,11 @@ class DensePlan(AbstractDiffusionPlan):
         sources: Sources,
         variances: Float[Array, " gaussians"],
         kernel: AbstractDiffusionKernel,
-        combination: AbstractCombination,
+        combination: DeviceMesh,
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
         everywhere = combination.gather(sources, axis=-1).of_layers(self.gaussians)
-        points = sources.centers if at is None else take_points(sources.centers, at)
+        points = take_points(sources.centers, at)
         layers = dense_layers(everywhere, points, self.variances_of_layers(variances), kernel)
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))
 

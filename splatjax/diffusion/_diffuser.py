@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from splatjax._combination import AbstractCombination
+from splatjax._combination import DeviceMesh
 from splatjax._smooth import albedo_root
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Material, Scene, Splats
@@ -20,16 +20,17 @@ _WIDE = 1e12  # variance of a layer that all splats resolve, mm^2
 
 
 class Sources(eqx.Module):
-    """The splats as sources of diffused light.
+    """The splats, or clusters of them, as sources of diffused light.
 
     **Attributes:**
 
+    - `normals`: `None` for sources that lie below their splats already.
     - `irradiance`: the irradiance that spreads: one for all layers, or one for each.
     - `weights`: factors of the splats on the weights of the material; `None` for 1.
     """
 
     centers: Float[Array, "3 sources"]
-    normals: Float[Array, "3 sources"]
+    normals: Float[Array, "3 sources"] | None
     areas: Float[Array, " sources"]
     irradiance: Float[Array, "channels *layers sources"]
     weights: Float[Array, "gaussians channels sources"] | None = None
@@ -115,8 +116,6 @@ class AbstractDiffusionPlan(eqx.Module):
 
     def material(self, material: Material) -> Material:
         """Return the material of the layers, reduced to the parameters on which they depend."""
-        if material.medium is None:
-            return material
         return dataclasses.replace(material, medium=None)
 
     def shown(self, scene: Scene) -> Scene:
@@ -138,7 +137,7 @@ class AbstractDiffusionPlan(eqx.Module):
         sources: Sources,
         variances: Float[Array, " gaussians"],
         kernel: AbstractDiffusionKernel,
-        combination: AbstractCombination,
+        combination: DeviceMesh,
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
         r"""Evaluate the layers at the splats, from all nearby splats in object space, of any
@@ -162,7 +161,7 @@ class AbstractDiffusionPlan(eqx.Module):
         source: Float[Array, "channels splats"],
         beams: Callable[[], Beams],
         kernel: AbstractDiffusionKernel,
-        combination: AbstractCombination,
+        combination: DeviceMesh,
         at: Int[Array, " points"] | None = None,
         bounced: Float[Array, "channels splats"] | None = None,
     ) -> tuple[Diffused, PyTree]:
@@ -201,7 +200,7 @@ class AbstractDiffusionPlan(eqx.Module):
         sources: Sources,
         variances: Float[Array, " gaussians"],
         kernel: AbstractDiffusionKernel,
-        combination: AbstractCombination,
+        combination: DeviceMesh,
         at: Int[Array, " points"] | None = None,
     ) -> tuple[Diffused, Diffused]:
         """Diffuse, and differentiate each layer with respect to the logarithm of its variance."""

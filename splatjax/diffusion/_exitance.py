@@ -5,7 +5,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
-from splatjax.scene import Material
 
 from ._clustered import ClusterDiffuser
 from ._diffuser import (
@@ -65,9 +64,6 @@ class ExitancePlan(AbstractDiffusionPlan):
         """Sum the layers of a plan, if it has several."""
         return cls(jnp.zeros(1, jnp.int32), plan, interval) if plan.separate else plan
 
-    def material(self, material: Material) -> Material:
-        return self.layers.material(material)
-
     def shares(self):
         return self.layers.shares()
 
@@ -75,7 +71,6 @@ class ExitancePlan(AbstractDiffusionPlan):
         diffused, _ = self.layers.light(
             splats, material, source, beams, kernel, combination, at, bounced
         )
-        at = jnp.arange(splats.count) if at is None else at
         factors = Sources.of(splats, source).weights
         albedo = jnp.ones_like(source) if splats.albedo is None else splats.albedo.T
         along_splats = jax.tree.map(

@@ -40,11 +40,6 @@ class SourceTable(eqx.Module):
     rows: tuple[Float[Array, "blocks block"], ...]
     moments: bool = eqx.field(static=True)
 
-    @property
-    def count(self) -> int:
-        """The number of sums."""
-        return len(self.rows) * (4 if self.moments else 1)
-
     def planes(self) -> list[Float[Array, "blocks block"]]:
         """Compute the summed rows and moments."""
         centers = self.centers if self.moments else ()
@@ -80,45 +75,6 @@ class SourceTable(eqx.Module):
             self,
             cotangents,
         )
-
-
-class Lanes(eqx.Module):
-    """Lists that are swept together, one per lane.
-
-    **Attributes:**
-
-    - `lists`: the list of each lane; empty lanes hold distinct numbers beyond all lists.
-    - `first`, `counts`: first row and number of rows of each list.
-    - `rows`: the rows of all lists.
-    - `kernels`, `points`: of each lane.
-    - `places`: indices of the layer, of all sums, and of the points among the sums.
-    """
-
-    lists: Int[Array, " lanes"]
-    first: Int[Array, " lanes"]
-    counts: Int[Array, " lanes"]
-    rows: Int[Array, "rows width"]
-    kernels: TruncatedGaussian
-    points: Float[Array, "lanes 3 block"]
-    places: tuple
-
-    def each_row(self, table: SourceTable, add: Callable, start):
-        """Apply `add(ids, sources, weights, minus_slopes, carry)` to row after row: the blocks of
-        sources `[lanes, width]`, the sources, and of every source at every point `[lanes, sources,
-        points]` the weight, and minus its derivative in the exponent.
-        """
-
-        def step(i, carry):
-            row = jnp.where(i < self.counts, self.first + i, len(self.rows) - 1)
-            ids = self.rows.at[row].get(mode="promise_in_bounds")
-            sources = table.gather(ids)
-            dx, dy, dz = (
-                self.points[:, axis, None] - center[:, :, None]
-                for axis, center in enumerate(sources.centers)
-            )
-            return add(ids, sources, *self.kernels(dx * dx + dy * dy + dz * dz), carry)
-
-        return jax.lax.fori_loop(0, jnp.max(self.counts), step, start)
 
 
 class _Sweep(eqx.Module):
@@ -160,8 +116,19 @@ class _Sweep(eqx.Module):
         lists, order = Lists(lists.rows, lists.first, counts), jnp.argsort(-counts)
         return cls(kernels, lists, order.astype(jnp.int32), ranks.reshape(shape), count)
 
-    def sweep(self, sweep: Callable, points: Float[Array, "lists 3 block"], out):
-        """Apply `sweep(lanes, out)` to all lists with a row, `LANES` of them at a time."""
+    def sweep(
+        self, sweep: Callable, points: Float[Array, "lists 3 block"], table: SourceTable, out
+    ):
+        """Apply `sweep(lists, points, places, each_row, out)` to all lists with a row, `LANES` of
+        them at a time.
+
+        Each lane has a list (distinct numbers beyond all lists for none), its points, and their
+        places: indices of the layer, of all sums, and of the points among the sums.
+        `each_row(add, carry)` applies `add(ids, sources, weights, minus_slopes, carry)` to row
+        after row of the lists: the blocks of sources `[lanes, width]`, the sources, and of every
+        source at every point `[lanes, sources, points]` the weight, and minus its derivative in the
+        exponent.
+        """
         lists, count = self.lists, len(self.order)
         lanes = min(LANES, count)
         order = jnp.append(self.order, jnp.arange(count, count + -count % lanes, dtype=jnp.int32))
@@ -177,7 +144,21 @@ class _Sweep(eqx.Module):
             kernels = jax.tree.map(lambda leaf: leaf.at[layer].get(mode="clip"), self.kernels)
             here = points.at[of_lanes].get(mode="fill", fill_value=FAR)
             places = layer[:, None], slice(None), self.ranks[block]
-            return sweep(Lanes(of_lanes, first, counts, lists.rows, kernels, here, places), out)
+
+            def each_row(add: Callable, carry):
+                def add_row(i, carry):
+                    row = jnp.where(i < counts, first + i, len(lists.rows) - 1)
+                    ids = lists.rows.at[row].get(mode="promise_in_bounds")
+                    sources = table.gather(ids)
+                    dx, dy, dz = (
+                        here[:, axis, None] - center[:, :, None]
+                        for axis, center in enumerate(sources.centers)
+                    )
+                    return add(ids, sources, *kernels(dx * dx + dy * dy + dz * dz), carry)
+
+                return jax.lax.fori_loop(0, jnp.max(counts), add_row, carry)
+
+            return sweep(of_lanes, here, places, each_row, out)
 
         return jax.lax.fori_loop(jnp.zeros_like(sweeps), sweeps, step, out)
 
@@ -186,15 +167,16 @@ def _forward(sweeps: _Sweep, points, table: SourceTable):
     def add(_ids, sources: SourceTable, weights, _slopes, sums):
         return sums + jnp.einsum("lrs,lsp->lrp", sources.rows_and_moments(), weights)
 
-    def sweep(lanes: Lanes, sums):
-        lane_sums = jnp.zeros((len(lanes.points), table.count, points.shape[2]), points.dtype)
-        lane_sums = lanes.each_row(table, add, lane_sums)
+    def sweep(_lists, here, places, each_row, sums):
+        zeros = jnp.zeros((len(here), count, points.shape[2]), points.dtype)
+        lane_sums = each_row(add, zeros)
         # No place is written twice; else the derivative searches for the last of several values.
-        places = sums.at[lanes.places]
+        places = sums.at[places]
         return places.set(jnp.swapaxes(lane_sums, 1, 2), mode="drop", unique_indices=True)
 
-    shape = len(sweeps.kernels.largest), table.count, sweeps.count
-    return sweeps.sweep(sweep, points, zeros_after(table.rows[0], shape, points.dtype))
+    count = len(table.rows) * (4 if table.moments else 1)
+    shape = len(sweeps.kernels.largest), count, sweeps.count
+    return sweeps.sweep(sweep, points, table, zeros_after(table.rows[0], shape, points.dtype))
 
 
 @full_precision
@@ -211,14 +193,14 @@ def _backward(residuals, cotangents):
     """
     sweeps, points, table = residuals
 
-    def sweep(lanes: Lanes, carry):
-        cotangent = cotangents.at[lanes.places].get(mode="fill", fill_value=0).swapaxes(1, 2)
+    def sweep(lists, here, places, each_row, carry):
+        cotangent = cotangents.at[places].get(mode="fill", fill_value=0).swapaxes(1, 2)
 
         def add(ids, sources: SourceTable, weights, minus_slopes, carry):
             d_here, d_table = carry
             centers = jnp.stack(sources.centers, axis=1)
             origin = centers[:, :, :1]
-            x, p = lanes.points - origin, centers - origin
+            x, p = here - origin, centers - origin
             _, pull_rows = jax.vjp(SourceTable.rows_and_moments, sources)
             g = minus_slopes * sources.contract(cotangent)
             # Sum over the points: the cotangents of the sources.
@@ -235,13 +217,13 @@ def _backward(residuals, cotangents):
             return d_here, d_table.scatter_add(ids, d_sources)
 
         d_points, d_table = carry
-        d_here, d_table = lanes.each_row(table, add, (jnp.zeros_like(lanes.points), d_table))
-        return d_points.at[lanes.lists].set(d_here, mode="drop"), d_table
+        d_here, d_table = each_row(add, (jnp.zeros_like(here), d_table))
+        return d_points.at[lists].set(d_here, mode="drop"), d_table
 
     start = jax.tree.map(
         lambda array: zeros_after(cotangents, array.shape, array.dtype), (points, table)
     )
-    return sweeps.sweep(sweep, points, start)
+    return sweeps.sweep(sweep, points, table, start)
 
 
 _sums = jax.custom_vjp(_forward)

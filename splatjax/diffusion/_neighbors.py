@@ -66,31 +66,6 @@ class Boxes(eqx.Module):
         return jnp.maximum(jnp.max(jnp.where(self.low <= self.high, out, 0), axis=1), 0)
 
 
-class Neighbors(eqx.Module):
-    """The blocks of sources within reach of every block of points, and the assumptions of the
-    search.
-
-    **Attributes:**
-
-    - `layers`: the layer of each block of sources.
-    - `reaches`: the reach of each layer, mm.
-    """
-
-    lists: Lists
-    points: Boxes
-    sources: Boxes
-    layers: Int[Array, " blocks"]
-    reaches: Float[Array, " layers"]
-
-    def needed(
-        self, points: Boxes, sources: Boxes, reaches: Float[Array, " layers"]
-    ) -> Float[Array, ""]:
-        """Compute a number above 1 if sources within reach of points may be missing."""
-        moved = jax.ops.segment_max(sources.beyond(self.sources), self.layers, len(reaches))
-        moved = jnp.maximum(moved, 0) + jnp.max(points.beyond(self.points), initial=0)
-        return jnp.max((reaches + math.sqrt(3) * moved) / self.reaches)
-
-
 def find_neighbors(
     points: Boxes,
     sources: Boxes,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
-from splatjax._records import check_values
+from splatjax._records import record, valid
 from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
 
@@ -32,6 +32,7 @@ _OPEN = 0.05  # sum of the normals, by area, over the area: an open neck leaves 
 _MOST = 24  # largest number of matrix products of the solver
 
 
+@record
 class ShapeDiffuser(AbstractDiffuser):
     r"""Solves the diffusion equation in the body that closed splats bound; the other diffusers
     apply the profile of a flat half space to its surface. With the fluence `phi`, `G = exp(-kappa
@@ -67,14 +68,12 @@ class ShapeDiffuser(AbstractDiffuser):
     Weitz 1991, "Internal reflection of diffusive light in random media" (`z_e`).
     """
 
-    error: float = eqx.field(static=True, default=1e-4)
-    opening: float = eqx.field(static=True, default=0.5)
-
-    def __check_init__(self):
-        check_values("ShapeDiffuser.error", self.error, "positive", lambda x: x > 0)
-        check_values(
-            "ShapeDiffuser.opening", self.opening, "between 0 and 1", lambda x: (x >= 0) & (x <= 1)
-        )
+    error: float = eqx.field(static=True, default=1e-4, metadata=valid("positive", lambda x: x > 0))
+    opening: float = eqx.field(
+        static=True,
+        default=0.5,
+        metadata=valid("between 0 and 1", lambda x: (x >= 0) & (x <= 1)),
+    )
 
     def radiant_exitance(
         self,
@@ -93,12 +92,8 @@ class ShapeDiffuser(AbstractDiffuser):
         - `hierarchy`: near splats and clusters, from `find_hierarchy`.
         - `bounced`: irradiance of uniform light that enters beside the beams.
         """
-        surface = SurfaceSums.of(splats, hierarchy)
-        exitance = self.exitance_on_surface(surface, medium, *padded((beams, bounced)))
-        return exitance[:, : splats.count]
-
-    def exitance_on_surface(self, surface: SurfaceSums, medium, beams, bounced):
-        """Compute `radiant_exitance` of padded splats."""
+        surface, count = SurfaceSums.of(splats, hierarchy), splats.count
+        beams, bounced = padded((beams, bounced))
         coefficients, area = DiffusionCoefficients.of(medium), jnp.sum(surface.areas)
         spread = jnp.sqrt(jnp.sum(surface.areas**2) / area)
         # A medium without absorption is the limit of a small kappa: the square of this fraction is
@@ -126,7 +121,7 @@ class ShapeDiffuser(AbstractDiffuser):
             single_layer = surface.layers(kernel, jnp.ones_like(z_e), inward, dipole=0.0)
             source = source + single_layer + unseen * inward
         right = jnp.where(exists, source / diagonal, 0.0)
-        return flux * solve(product, right, self.error) + leaving
+        return (flux * solve(product, right, self.error) + leaving)[:, :count]
 
     def find_hierarchy(self, splats: Splats) -> Hierarchy:
         """Check that the splats bound a body, and choose near splats and clusters. Not for traced
@@ -201,12 +196,14 @@ class ShapePlan(AbstractDiffusionPlan):
         return dataclasses.replace(material.surface_of(material.gaussians), medium=material.medium)
 
     def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
+        light = beams()
+        exitance = self.diffuser.radiant_exitance(
+            splats, material.medium, light, self.hierarchy, bounced
+        )
         surface = SurfaceSums.of(splats, self.hierarchy)
-        light = padded((beams(), bounced))
-        exitance = self.diffuser.exitance_on_surface(surface, material.medium, *light)
-        solved = SolvedLight.of(surface, material, exitance, *light)
-        at = jnp.arange(splats.count) if at is None else at
-        layers = LayerValues(*(take_points(row[None], at) for row in (exitance, solved.slopes)))
+        solved = SolvedLight.of(surface, material, *padded((exitance, light, bounced)))
+        slopes = solved.slopes[..., : splats.count]
+        layers = LayerValues(take_points(exitance[None], at), take_points(slopes[None], at))
         return Diffused(layers, jnp.zeros_like(exitance[0, 0])), solved
 
     def towards(self, eye, splats, material, layers, solved, at):

@@ -17,9 +17,11 @@ from ._hierarchy import Clusters, Hierarchy, cluster_totals, padded
 
 GRAZING = 1e-3  # cosine
 _OVERLAP = 1.5  # radius of a splat over the root of its area
-_TERMS, _SMALL = 8, 0.1  # highest order of the softening's series near 0, and where it is used
+_SMALL = 0.1  # squared distance, in softening lengths, below which a series is used
 _NODES, _REACH = 12, 4.0  # of the integral of the removed part: nodes, and end in softening lengths
 _SCALE = 2 / math.sqrt(math.pi)
+# The series of `erf(sqrt(q)) / sqrt(q)` up to the eighth power of q.
+_SERIES = [_SCALE * (-1) ** n / (math.factorial(n) * (2 * n + 1)) for n in range(8, -1, -1)]
 SOFTENED = 3.0  # softening lengths beyond which the kernel is not softened
 
 
@@ -77,14 +79,9 @@ class ScreenedKernel(eqx.Module):
         root, small = jnp.sqrt(away), jnp.where(near, q, 0.0)
         ratio = jax.scipy.special.erf(root) / root
         fall = (ratio - _SCALE * jnp.exp(-away)) / away
-        by_series, fall_by_series = jnp.zeros_like(q), jnp.zeros_like(q)
-        for n in range(_TERMS, -1, -1):
-            term = _SCALE * (-1) ** n / (math.factorial(n) * (2 * n + 1))
-            by_series = by_series * small + term
-            if n:
-                fall_by_series = fall_by_series * small - 2 * n * term
-        ratio = jnp.where(near, by_series, ratio)
-        fall = jnp.where(near, fall_by_series, fall)
+        series, slope = (jnp.asarray(s, q.dtype) for s in (_SERIES, -2 * np.polyder(_SERIES)))
+        ratio = jnp.where(near, jnp.polyval(series, small), ratio)
+        fall = jnp.where(near, jnp.polyval(slope, small), fall)
         return ratio / self.length, fall / self.length**3
 
     def plane_integral(self, height: Float[Array, "channels *points"]) -> Float[Array, "..."]:

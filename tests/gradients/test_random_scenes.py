@@ -243,14 +243,12 @@ FARTHEST = 1e15  # mm, to which all is near
 
 def far_reaching(plan: ClusterPlan) -> ClusterPlan:
     """Let all sources be near all points, whatever the variances."""
-    neighbors = plan.neighbors
-    reaches = np.where(np.isfinite(neighbors.reaches), FARTHEST, 0.0)
-    lists = find_neighbors(neighbors.points, neighbors.sources, neighbors.layers, reaches.tolist())
-    farthest = jnp.full_like(neighbors.reaches, 10 * FARTHEST)
-    neighbors = dataclasses.replace(neighbors, lists=lists, reaches=farthest)
-    return dataclasses.replace(
-        plan, neighbors=neighbors, margin=jnp.full_like(plan.margin, jnp.inf)
-    )
+    reaches = np.where(np.isfinite(plan.reaches), FARTHEST, 0.0)
+    layers = plan.sources.layers
+    lists = find_neighbors(plan.point_boxes, plan.source_boxes, layers, reaches.tolist())
+    farthest = jnp.full_like(plan.reaches, 10 * FARTHEST)
+    margin = jnp.full_like(plan.margin, jnp.inf)
+    return dataclasses.replace(plan, lists=lists, reaches=farthest, margin=margin)
 
 
 def is_finite(shape: Shape, world: World, factors=1.0) -> bool:
