@@ -39,18 +39,6 @@ class AbstractCombination(eqx.Module):
         """
         return functools.reduce(add, parts, start)
 
-    def own_share(self, rows: Partial) -> Partial:
-        """Sum the rows of all devices, and keep this device's share of them. Differentiable."""
-        return rows
-
-    def own_rows(self, rows: Shaped[Array, "rows ..."]) -> Shaped[Array, "share ..."]:
-        """Keep this device's share of rows that are the same on all devices."""
-        return rows
-
-    def gather(self, share: Partial, axis: int = 0) -> Partial:
-        """Concatenate the shares of all devices along an axis. Differentiable."""
-        return share
-
 
 class DeviceMesh(AbstractCombination):
     """Each device of a mesh, of any axes, has one part; inside `jax.shard_map`, by the collectives
@@ -77,14 +65,17 @@ class DeviceMesh(AbstractCombination):
         (part,) = partials
         return jax.tree.map(lambda leaf: jax.lax.pmax(jax.lax.stop_gradient(leaf), self.axes), part)
 
-    def own_share(self, rows):
+    def own_share(self, rows: Partial) -> Partial:
+        """Sum the rows of all devices, and keep this device's share of them. Differentiable."""
         return jax.lax.psum_scatter(rows, self.axes, scatter_dimension=0, tiled=True)
 
-    def own_rows(self, rows):
+    def own_rows(self, rows: Shaped[Array, "rows ..."]) -> Shaped[Array, "share ..."]:
+        """Keep this device's share of rows that are the same on all devices."""
         share = rows.shape[0] // self.count
         return jax.lax.dynamic_slice_in_dim(rows, jax.lax.axis_index(self.axes) * share, share)
 
-    def gather(self, share, axis=0):
+    def gather(self, share: Partial, axis: int = 0) -> Partial:
+        """Concatenate the shares of all devices along an axis. Differentiable."""
         return jax.tree.map(
             lambda rows: jax.lax.all_gather(rows, self.axes, axis=axis % rows.ndim, tiled=True),
             share,
@@ -123,10 +114,12 @@ def extreme(
     return largest + total / count - jax.lax.stop_gradient(total / count)
 
 
-def lay_out(mesh: Mesh, trees: Partial, specs: Partial) -> Partial:
-    """Distribute arrays over a mesh with explicit axes; for others `shard_map` itself does so."""
+def lay_out(mesh: Mesh, trees: Partial, specs: PyTree[PartitionSpec]) -> Partial:
+    """Distribute trees of arrays over a mesh with explicit axes, by one specification for each tree
+    or array; for other meshes `shard_map` itself does so.
+    """
     if AxisType.Explicit not in mesh.axis_types:
         return trees
     return jax.tree.map(
-        lambda leaf, spec: jax.reshard(leaf, NamedSharding(mesh, spec)), trees, specs
+        lambda spec, tree: jax.reshard(tree, NamedSharding(mesh, spec)), specs, trees
     )

@@ -32,5 +32,5 @@ from ._kernel import (
     unevenness as unevenness,
 )
 from ._shape import ShapeDiffuser as ShapeDiffuser, ShapePlan as ShapePlan
-from ._streamed import StreamedDiffusion as StreamedDiffusion
+from ._streamed import streamed_layers as streamed_layers
 from ._clusters import POINTS_PER_BLOCK as POINTS_PER_BLOCK, compact_order as compact_order

@@ -14,10 +14,10 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from splatjax._chunking import Result
-from splatjax._combination import AbstractCombination, DeviceMesh, lay_out
+from splatjax._combination import DeviceMesh, lay_out
 from splatjax._records import is_traced
 from splatjax.gaussians import pad_gaussians
-from splatjax.scene import AbstractLightSample, Camera, Frame, Scene, lights_by_kind
+from splatjax.scene import AbstractLightSample, Camera, Frame, Scene, Splats, lights_by_kind
 
 from ._checks import in_one_dtype
 from ._lighting import Transfer
@@ -199,27 +199,25 @@ def on_devices(
     scene, replicated, rows = in_one_dtype(scene, replicated, rows)
     devices, per_device = splats_per_device(scene.splats.count, plan.mesh)
     count = devices * per_device
-    scene = Scene(pad_splats(scene.splats, count), scene.lights, scene.material)
+    splats = pad_splats(scene.splats, count)
     rows = jax.tree.map(lambda row: jnp.pad(row, ((0, count - len(row)), (0, 0))), rows)
     extra = () if placed is None else (placed,)
 
-    def run(combination: AbstractCombination, scene: Scene, plan: Plan, replicated, rows, extra):
-        splats = arrange(scene.splats, plan.order, plan.exists)
-        scene = Scene(splats, scene.lights, scene.material)
+    def run(combination: DeviceMesh, splats: Splats, lit, plan: Plan, replicated, rows, extra):
+        scene = Scene(arrange(splats, plan.order, plan.exists), *lit)
         rows = jax.tree.map(lambda row: row[plan.order], rows)
         return function(Passes(scene, settings, plan, combination), *replicated, *rows, *extra)
 
-    arguments = scene, plan, replicated, rows, extra
+    arguments = splats, (scene.lights, scene.material), plan, replicated, rows, extra
     if plan.mesh is None:
         return run(DeviceMesh(), *arguments)
     mesh = DeviceMesh.of(plan.mesh)
-    of_scene, of_replicated = jax.tree.map(lambda _: PartitionSpec(), (scene, replicated))
-    of_splats, of_rows = jax.tree.map(lambda _: mesh.shares, (scene.splats, rows))
     specs = (
-        eqx.tree_at(lambda scene: scene.splats, of_scene, of_splats),
+        mesh.shares,
+        PartitionSpec(),
         plan.specs(mesh),
-        of_replicated,
-        of_rows,
+        PartitionSpec(),
+        mesh.shares,
         along_splats(extra, mesh),
     )
     out_specs = PartitionSpec()
@@ -295,15 +293,12 @@ def _map_over(mesh: Mesh, function: Callable, shared: PyTree, batch: PyTree) -> 
         replicated = eqx.combine(shared, static[0])
         return jax.lax.map(lambda item: function(replicated, eqx.combine(item, static[1])), batch)
 
-    specs = (
-        jax.tree.map(lambda _: PartitionSpec(), arrays[0]),
-        jax.tree.map(lambda _: devices.shares, arrays[1]),
-    )
+    specs = PartitionSpec(), devices.shares
     mapped = jax.shard_map(
         share, mesh=mesh, in_specs=specs, out_specs=devices.shares, check_vma=False
     )
     results = mapped(*lay_out(mesh, arrays, specs))
     if len(places) == count:
         return results
-    replicated = lay_out(mesh, results, jax.tree.map(lambda _: PartitionSpec(), results))
+    replicated = lay_out(mesh, results, PartitionSpec())
     return jax.tree.map(lambda leaf: leaf[:count], replicated)

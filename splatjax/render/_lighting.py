@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
 from splatjax._chunking import materialized
-from splatjax._combination import AbstractCombination
+from splatjax._combination import DeviceMesh
 from splatjax.scene import (
     AbstractLightSample,
     AbstractPointSample,
@@ -156,7 +156,7 @@ def cast_shadows(
     scene: Scene,
     shadows: tuple[ShadowPlan | None, ...],
     splatting: _splatting.SplattingSettings,
-    combination: AbstractCombination,
+    combination: DeviceMesh,
 ) -> LightVisibility:
     """Render the shadow maps of all lights (4.1) and look up the splats in them."""
     splats, groups = scene.splats, stack_lights(scene.lights)

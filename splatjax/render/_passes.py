@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
 from splatjax._chunking import Result, map_chunks, take_points
-from splatjax._combination import AbstractCombination
+from splatjax._combination import DeviceMesh
 from splatjax.scene import Scene, stack_lights
 
 from ._lighting import (
@@ -32,7 +32,6 @@ from ._surface import (
     ShadedSurface,
     SurfaceAttributes,
     SurfaceSamples,
-    in_a_row,
     map_places,
     shade,
     split_rows,
@@ -66,8 +65,8 @@ class SplatLight(eqx.Module):
     needed: Float[Array, ""]
     solved: PyTree | None = None
 
-    def take(self, chosen: Int[Array, " chosen"]) -> "SplatLight":
-        """Return the light of some splats."""
+    def take(self, chosen: Int[Array, " chosen"] | None) -> "SplatLight":
+        """Return the light of some splats; of all for `None`."""
         taken = jax.tree.map(
             lambda leaf: take_points(leaf, chosen) if leaf.ndim else leaf,
             dataclasses.replace(self, solved=None),
@@ -87,7 +86,7 @@ class Passes(eqx.Module):
     scene: Scene
     settings: RenderSettings
     plan: Plan
-    combination: AbstractCombination
+    combination: DeviceMesh
 
     def visibility(self) -> LightVisibility:
         """Render the shadow maps and look up the splats in them (pass 1)."""
@@ -111,7 +110,7 @@ class Passes(eqx.Module):
         - `derivative`: also differentiate the layers in the material's Gaussians.
         """
         if isinstance(kept, SplatLight):
-            return kept if at is None else kept.take(at)
+            return kept.take(at)
         splats, material = self.scene.splats, self.scene.material
         light = (
             self.visibility()
@@ -135,10 +134,9 @@ class Passes(eqx.Module):
                 splats, material, source, beams, kernel, combination, at, bounced
             )
         needed = jnp.maximum(light.needed, jnp.maximum(bounce_needed, diffused.needed))
-        along_splats = light.visibility, irradiance, added
-        if at is not None:
-            along_splats = jax.tree.map(partial(take_points, chosen=at), along_splats)
-        visibility, irradiance, added = along_splats
+        visibility, irradiance, added = jax.tree.map(
+            partial(take_points, chosen=at), (light.visibility, irradiance, added)
+        )
         return SplatLight(visibility, irradiance, diffused.layers, slopes, added, needed, solved)
 
     def irradiance(
@@ -172,7 +170,8 @@ class Passes(eqx.Module):
                 f"settings.bounces is {self.settings.bounces}, and the plan was made with 0; "
                 "make it with the same settings"
             )
-        at = sightlines.first_splats()
+        # The first splat of each group of this device.
+        at = jnp.arange(len(sightlines.seen), dtype=jnp.int32) * sightlines.size
         summed = _diffusion.ExitancePlan.of(self.plan.diffusion, self.plan.interval)
         splats, albedo, kernel = self.scene.splats, self.scene.splats.albedo, self.settings.kernel
         root = jnp.ones_like(direct.source) if albedo is None else _shading.albedo_root(albedo.T)
@@ -228,13 +227,12 @@ class Passes(eqx.Module):
 
         # Passes 2 and 3: blend the attributes and layers of the splats that may be visible.
         splats = scene.splats.take(chosen)
-        visible_scene = Scene(splats, scene.lights, scene.material)
-        shown = plan.diffusion.shown(visible_scene)
+        shown = plan.diffusion.shown(Scene(splats, scene.lights, scene.material))
         layers = plan.diffusion.towards(
             view.position, scene.splats, scene.material, light.layers, light.solved, chosen
         )
         attributes = settings.lighting.attributes(
-            visible_scene,
+            shown,
             LightVisibility(groups, light.visibility, light.needed),
             light.irradiance,
             view.position,
@@ -242,17 +240,11 @@ class Passes(eqx.Module):
         origin = _splatting.Bounds.of(scene.splats, self.combination).center[:, None]
         origin = jax.lax.stop_gradient(origin)
         centers = splats.centers.T - origin
-        attributes = dataclasses.replace(
-            attributes,
-            weights=None if shown.splats.weights is None else attributes.weights,
-            centers=centers,
-            layers=_diffusion.continue_from_splats(layers, centers),
-            derivative=light.derivative
-            and _diffusion.continue_from_splats(light.derivative, centers),
-            added_source=light.added_source,
-        )
+        derivative = light.derivative and _diffusion.continue_from_splats(light.derivative, centers)
+        attributes = dataclasses.replace(attributes, added_source=light.added_source)
+        rows = attributes, (centers, _diffusion.continue_from_splats(layers, centers), derivative)
         visible = _splatting.visible_surfaces(
-            splats, stack_rows(attributes), view, plan.splatting, plan.raster, self.combination
+            splats, stack_rows(rows), view, plan.splatting, plan.raster, self.combination
         )
 
         needed = self.combination.largest([jnp.maximum(chosen_needed, light.needed)])
@@ -260,7 +252,6 @@ class Passes(eqx.Module):
 
         # Pass 5: shade the visible points.
         def shade_and_read(samples: SurfaceSamples) -> Result:
-            samples = jax.tree.map(in_a_row, samples)
             shaded, layers = shade(
                 shown,
                 view.position,
@@ -273,7 +264,7 @@ class Passes(eqx.Module):
             )
             return read(shaded, layers, samples)
 
-        sample = partial(sample_surfaces, visible, attributes, origin)
+        sample = partial(sample_surfaces, visible, rows, origin)
 
         # A separate call, so that samples are materialized; large chunks, so that few are at once.
         def sample_and_read(sums, tiles) -> Result:
@@ -288,7 +279,7 @@ class Passes(eqx.Module):
 
 def sample_surfaces(
     visible: _splatting.VisibleSurfaces,
-    like: SurfaceAttributes,
+    like: tuple[SurfaceAttributes, tuple | None],
     origin: Float[Array, "3 1"],
     sums: _splatting.PixelSums,
     tiles: Int[Array, " places"],
@@ -298,7 +289,8 @@ def sample_surfaces(
     **Arguments:**
 
     - `visible`: the visible surfaces of all places.
-    - `like`: the attributes whose rows were summed.
+    - `like`: the attributes whose rows were summed; and, of the splats, centers, layers as
+      `continue_from_splats` prepares them, and derivative, or `None` without layers.
     - `origin`: the origin of the splats' centers among the attributes.
     - `sums`, `tiles`: the entries of `visible` for these places.
     """
@@ -307,18 +299,15 @@ def sample_surfaces(
     # Place by place, as the sums are in memory.
     @jax.vmap
     def of_place(rows, positions, depth, covered) -> SurfaceSamples:
-        attributes = split_rows(rows, like)
+        attributes, of_layers = split_rows(rows, like)
         layers, derivative = jnp.zeros((0, 1, len(depth)), depth.dtype), None
-        if attributes.layers is not None:
+        if of_layers is not None:
+            centers, layers, derivative = of_layers
             layers, derivative = _diffusion.continue_to_points(
-                attributes.layers,
-                attributes.derivative,
-                attributes.centers,
-                positions - origin,
-                len(attributes.source),
+                layers, derivative, centers, positions - origin, len(attributes.source)
             )
-        attributes = dataclasses.replace(attributes, centers=None, layers=None, derivative=None)
         return SurfaceSamples(attributes, positions, depth, covered, layers, derivative)
 
-    positions = visible.points(tiles, surface.depth)
+    x, y = (index.astype(origin.dtype) + 0.5 for index in visible.grid.columns_and_rows(tiles))
+    positions = jnp.moveaxis(visible.view.unproject(x, y, surface.depth), 0, 1)
     return of_place(surface.attributes, positions, surface.depth, surface.covered)

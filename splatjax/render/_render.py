@@ -191,9 +191,7 @@ def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> I
 
     irradiance = on_devices(entering, scene, settings, plan, by_splat=True)
     if plan.mesh is not None:
-        irradiance = lay_out(
-            plan.mesh, irradiance, jax.tree.map(lambda _: PartitionSpec(), irradiance)
-        )
+        irradiance = lay_out(plan.mesh, irradiance, PartitionSpec())
     return jax.tree.map(lambda rows: rows[:, : scene.splats.count], irradiance)
 
 

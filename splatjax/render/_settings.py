@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._records import check_values
+from splatjax._records import record, valid
 from splatjax.scene import (
     AbstractLightSample,
     DistantStratum,
@@ -68,6 +68,7 @@ class LightAtSplats(AbstractLighting):
         return samples.attributes
 
 
+@record
 class RenderSettings(eqx.Module):
     r"""Settings of the passes, and the algorithms that compute them.
 
@@ -104,7 +105,7 @@ class RenderSettings(eqx.Module):
     sample_shadows: _splatting.ShadowSettings = _splatting.ShadowSettings(
         resolution=512, compared=2, merged_spacing=4.0
     )
-    bounces: int = eqx.field(static=True, default=0)
+    bounces: int = eqx.field(static=True, default=0, metadata=valid("0 or more", lambda n: n >= 0))
     sightlines: _splatting.SightlineSettings = _splatting.SightlineSettings()
     kernel: _diffusion.AbstractDiffusionKernel = _diffusion.EscapeNormalization()
     rasterizer: _splatting.AbstractRasterizer = _splatting.TileRasterizer()
@@ -112,7 +113,6 @@ class RenderSettings(eqx.Module):
     lighting: AbstractLighting = LightAtSplats()
 
     def __check_init__(self):
-        check_values("bounces", self.bounces, "0 or more", lambda n: n >= 0)
         if self.bounces and not isinstance(self.lighting, LightAtSplats):
             raise ValueError(
                 f"bounces is {self.bounces} and lighting is {type(self.lighting).__name__}; "

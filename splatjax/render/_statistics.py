@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax import diffusion as _diffusion
+from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import Parts, Splats
 
 
@@ -44,69 +43,57 @@ def _mark(splats: Splats) -> Float[Array, " leaves"]:
     return jnp.stack([jnp.sum(leaf) for leaf in jax.tree.leaves(splats)])
 
 
-@dataclass(frozen=True)
-class StreamStatistics:
-    """Statistics of all splats of a stream. Lengths in mm.
+def measure_stream(
+    parts: Parts,
+) -> tuple[int, _splatting.Bounds, float, float, Float[Array, ""], Float[Array, ""]]:
+    """Read all parts twice, and keep the areas of the finest splats.
 
-    **Attributes:**
+    **Returns:**
 
-    - `part_size`: splats in every part but the last.
-    - `middle`, `reach`: the middle of the box around all centers, and an upper bound of the
-      distance to the farthest rim.
-    - `spacing`, `fine`: the root of the mean area, and the first percentile of the area, of splats
-      with a nonzero area; infinite without such splats.
-    - `discs`: the sum of these splats' squared radii divided by the sum of their areas.
-    - `unevenness`: the mean of the unevenness of the parts, weighted by their splats.
+    - the number of splats in every part but the last;
+    - the middle of the box around all centers, and the distance of the farthest one, plus the
+      largest radius, mm;
+    - the root of the mean area, mm, and the first percentile of the area, mm^2, of splats with a
+      nonzero area; infinite without such splats;
+    - the mean of the unevenness of the parts, weighted by these splats; and the sum of their
+      squared radii divided by the sum of their areas.
+
+    **Raises:** `ValueError` when there are no splats, or a part is larger than the first, or
+    smaller and not the last.
     """
-
-    part_size: int
-    middle: np.ndarray
-    reach: float
-    spacing: float
-    fine: float
-    discs: float
-    unevenness: float
-
-    @classmethod
-    def of(cls, parts: Parts) -> "StreamStatistics":
-        """Read all parts twice, and keep the areas of the finest splats.
-
-        **Raises:** `ValueError` when there are no splats, or a part is larger than the first, or
-        smaller and not the last.
-        """
-        # Sizes, extent and areas.
-        sizes, boxes, largest, sums = [], [], [], []
-        for part in filter(lambda part: part.count, parts()):
-            areas, radii = np.asarray(part.areas), np.asarray(part.radii)
-            sizes.append(part.count)
-            # Quicker than over an axis of three.
-            boxes.append([(axis.min(), axis.max()) for axis in np.asarray(part.centers).T])
-            largest.append(radii.max())
-            squares = np.sum(radii**2, where=areas > 0, dtype=np.float64)
-            sums.append((np.count_nonzero(areas), areas.sum(dtype=np.float64), squares))
-        if not sizes:
-            raise ValueError("parts has no splats; give at least one")
-        if any(size != sizes[0] for size in sizes[:-1]) or sizes[-1] > sizes[0]:
-            raise ValueError(
-                f"parts must have one size, except for a smaller last one; these have {sizes} "
-                "splats"
-            )
-        # Distance of the farthest splat, finest areas, and unevenness.
-        count, area, square = np.sum(sums, axis=0).tolist()
-        middle = (np.min(boxes, axis=0)[:, 0] + np.max(boxes, axis=0)[:, 1]) / 2
-        farthest, finest, uneven = 0.0, np.zeros(0), 0.0
-        rank = _diffusion.FINE_QUANTILE * max(count - 1, 0)
-        for part in filter(lambda part: part.count, parts()):
-            away, areas = (np.asarray(part.centers) - middle).T, np.asarray(part.areas)
-            farthest = max(farthest, float(np.max(sum(axis * axis for axis in away))))
-            finest = np.sort(np.concatenate([finest, areas[areas > 0]]))[: int(rank) + 2]
-            uneven += np.count_nonzero(areas) * float(_diffusion.unevenness(part))
-        return cls(
-            part_size=sizes[0],
-            middle=middle,
-            reach=math.sqrt(farthest) + float(max(largest)),
-            spacing=math.sqrt(area / count) if count else math.inf,
-            fine=float(np.interp(rank, np.arange(len(finest)), finest)) if count else math.inf,
-            discs=square / area if area else 1.0,
-            unevenness=uneven / max(count, 1),
+    # Sizes, extent and areas.
+    sizes, boxes, largest, sums = [], [], [], []
+    for part in filter(lambda part: part.count, parts()):
+        areas, radii = np.asarray(part.areas), np.asarray(part.radii)
+        sizes.append(part.count)
+        # Quicker than over an axis of three.
+        boxes.append([(axis.min(), axis.max()) for axis in np.asarray(part.centers).T])
+        largest.append(radii.max())
+        squares = np.sum(radii**2, where=areas > 0, dtype=np.float64)
+        sums.append((np.count_nonzero(areas), areas.sum(dtype=np.float64), squares))
+    if not sizes:
+        raise ValueError("parts has no splats; give at least one")
+    if any(size != sizes[0] for size in sizes[:-1]) or sizes[-1] > sizes[0]:
+        raise ValueError(
+            f"parts must have one size, except for a smaller last one; these have {sizes} splats"
         )
+    # Distance of the farthest splat, finest areas, and unevenness.
+    count, area, square = np.sum(sums, axis=0).tolist()
+    middle = (np.min(boxes, axis=0)[:, 0] + np.max(boxes, axis=0)[:, 1]) / 2
+    farthest, finest, uneven = 0.0, np.zeros(0), 0.0
+    rank = _diffusion.FINE_QUANTILE * max(count - 1, 0)
+    for part in filter(lambda part: part.count, parts()):
+        away, areas = (np.asarray(part.centers) - middle).T, np.asarray(part.areas)
+        farthest = max(farthest, float(np.max(sum(axis * axis for axis in away))))
+        finest = np.sort(np.concatenate([finest, areas[areas > 0]]))[: int(rank) + 2]
+        uneven += np.count_nonzero(areas) * float(_diffusion.unevenness(part))
+    dtype = part.centers.dtype
+    reach = math.sqrt(farthest) + float(max(largest))
+    return (
+        sizes[0],
+        _splatting.Bounds(jnp.asarray(middle, dtype), jnp.asarray(reach, dtype)),
+        math.sqrt(area / count) if count else math.inf,
+        float(np.interp(rank, np.arange(len(finest)), finest)) if count else math.inf,
+        jnp.asarray(uneven / max(count, 1), dtype),
+        jnp.asarray(square / area if area else 1.0, dtype),
+    )

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import map_chunks
-from splatjax._combination import PartByPart
+from splatjax._combination import DeviceMesh, PartByPart
 from splatjax._precision import full_precision
 from splatjax.scene import (
     AbstractLight,
@@ -40,12 +40,11 @@ from ._lighting import (
 from ._passes import sample_surfaces
 from ._plan import pad_splats
 from ._settings import RenderSettings
-from ._statistics import ReplayableStream, StreamStatistics
+from ._statistics import ReplayableStream, measure_stream
 from ._surface import (
     SurfaceAttributes,
     SurfaceSamples,
     compose,
-    in_a_row,
     map_places,
     shade,
     stack_rows,
@@ -93,10 +92,8 @@ def render_streamed(
             "TileRasterizer and a ClusterDiffuser can be streamed"
         )
     stream = ReplayableStream(parts, report)
-    statistics = StreamStatistics.of(lambda: stream("looking"))
-    part_size = (
-        -(-statistics.part_size // _diffusion.POINTS_PER_BLOCK) * _diffusion.POINTS_PER_BLOCK
-    )
+    size, bounds, spacing, fine, uneven, discs = measure_stream(lambda: stream("looking"))
+    part_size = -(-size // _diffusion.POINTS_PER_BLOCK) * _diffusion.POINTS_PER_BLOCK
 
     def scenes(task: str) -> Iterator[Scene]:
         for part in stream(task):
@@ -106,17 +103,14 @@ def render_streamed(
     check_channels(first)
     (first, camera), groups = in_one_dtype(first, camera), stack_lights(first.lights)
     dtype, view = first.splats.centers.dtype, _splatting.PerspectiveView.padded(camera)
-    middle, reach = (jnp.asarray(bound, dtype) for bound in (statistics.middle, statistics.reach))
-    bounds = _splatting.Bounds(middle, reach)
-    uneven = jnp.asarray(statistics.unevenness, dtype)
-    splatting = settings.splatting.measured(uneven, jnp.asarray(statistics.discs, dtype))
+    splatting = settings.splatting.measured(uneven, discs)
     settings = dataclasses.replace(settings, splatting=splatting)
 
     # Pass 1: the shadow maps of each light that casts shadows, in its group.
     def views_of(samples: list[AbstractLightSample]):
         if not samples[0].cast_shadows:
             return None
-        shadows = settings.shadows_of(samples[0]).for_spacing(statistics.spacing, bounds)
+        shadows = settings.shadows_of(samples[0]).for_spacing(spacing, bounds)
         return plan_views(samples, bounds, shadows)[0]
 
     of_lights = [
@@ -156,25 +150,24 @@ def render_streamed(
     visible, samples = _sample(seen, view, settings, attributes(first), bounds.center)
 
     # Pass 4, at the visible points.
-    interval = settings.kernel.interval(uneven)
-    diffusion = _diffusion.StreamedDiffusion(
-        diffuser,
-        settings.kernel,
-        first.material.gaussians.variances,
-        statistics.spacing,
-        statistics.fine,
-        interval,
-        samples.positions - bounds.center[None, :, None],
-        samples.covered,
-    )
-
     def sources() -> Iterator[_diffusion.Sources]:
         for scene in scenes("diffusion"):
             splats, (_, irradiance) = scene.splats, light(scene)
             centered = dataclasses.replace(splats, centers=splats.centers - bounds.center[None])
             yield _diffusion.Sources.of(centered, irradiance.source)
 
-    layers = diffusion.evaluate(sources(), first.material.channels)
+    interval = settings.kernel.interval(uneven)
+    gaussians, layers = _diffusion.streamed_layers(
+        sources(),
+        diffuser,
+        settings.kernel,
+        first.material,
+        spacing,
+        fine,
+        interval,
+        samples.positions - bounds.center[None, :, None],
+        samples.covered,
+    )
 
     # Pass 5.
     frame = _shade(
@@ -184,7 +177,7 @@ def render_streamed(
         visible,
         samples,
         layers,
-        diffusion.gaussians,
+        gaussians,
         interval,
         settings,
     )
@@ -255,8 +248,8 @@ def _sample(
     like: SurfaceAttributes,
     origin: Float[Array, "3"],
 ) -> tuple[_splatting.VisibleSurfaces, SurfaceSamples]:
-    visible = _splatting.VisibleSurfaces.of(sums, view, settings.splatting, PartByPart())
-    sample = partial(sample_surfaces, visible, like, origin[:, None])
+    visible = _splatting.VisibleSurfaces.of(sums, view, settings.splatting, DeviceMesh())
+    sample = partial(sample_surfaces, visible, (like, None), origin[:, None])
     return visible, map_chunks(
         sample, visible.sums, visible.tiles, at_once=_splatting.TILES_AT_ONCE
     )
@@ -275,9 +268,7 @@ def _shade(
     interval: Float[Array, "2"],
     settings: RenderSettings,
 ) -> Frame:
-    def shade_places(samples: SurfaceSamples, layers):
-        samples, layers = jax.tree.map(in_a_row, (samples, layers))
-        samples = dataclasses.replace(samples, layers=layers)
+    def shade_places(samples: SurfaceSamples):
         attributes = settings.lighting.at_pixels(scene, groups, samples)
         shaded, _ = shade(
             scene,
@@ -291,4 +282,5 @@ def _shade(
         )
         return shaded
 
-    return compose(scene, map_places(shade_places, samples, layers), visible)
+    samples = dataclasses.replace(samples, layers=layers)
+    return compose(scene, map_places(shade_places, samples), visible)

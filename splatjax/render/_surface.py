@@ -31,8 +31,6 @@ class SurfaceAttributes(eqx.Module):
       cast no shadows.
     - `single_scattering`: radiance towards the eye, without the albedo; `None` if the material has
       none.
-    - `layers`, `derivative`: the layers of pass 4 as `continue_from_splats` prepares them, and
-      their derivatives; `centers` are the splats', mm from an origin.
     - `added_source`: the derivative of `source` with respect to a weight of the Gaussians, if it is
       not zero.
     - `extra`: attributes of another `AbstractLighting`.
@@ -48,9 +46,6 @@ class SurfaceAttributes(eqx.Module):
     visibility: tuple[Float[Array, "_lights points"] | None, ...]
     single_scattering: Float[Array, "channels points"] | None = None
     weights: Float[Array, "gaussians channels points"] | None = None
-    centers: Float[Array, "3 points"] | None = None
-    layers: _diffusion.LayerValues | None = None
-    derivative: _diffusion.LayerValues | None = None
     added_source: Float[Array, "channels points"] | None = None
     extra: Any = None
 
@@ -264,14 +259,19 @@ def map_places(function: Callable[..., Result], *arrays: PyTree) -> Result:
 
     **Arguments:**
 
-    - `function`: returns arrays `[*rows, points]`, the pixels of its places in a row.
-    - `arrays`: along the places.
+    - `function`: takes and returns arrays `[*rows, points]`, the pixels of its places in a row.
+    - `arrays`: `[places, *rows, pixels]`.
 
-    **Returns:** the same arrays, `[places, *rows, pixels]`.
+    **Returns:** the results, `[places, *rows, pixels]`.
     """
 
+    def by_place(values: Shaped[Array, "*rows points"]) -> Shaped[Array, "places *rows pixels"]:
+        pixels = _splatting.TILE_SIDE**2
+        rows = values.reshape(*values.shape[:-1], values.shape[-1] // pixels, pixels)
+        return jnp.moveaxis(rows, -2, 0)
+
     return map_chunks(
-        lambda *chunks: jax.tree.map(_by_place, function(*chunks)),
+        lambda *chunks: jax.tree.map(by_place, function(*jax.tree.map(in_a_row, chunks))),
         *arrays,
         at_once=_splatting.TILES_AT_ONCE,
     )
@@ -280,9 +280,3 @@ def map_places(function: Callable[..., Result], *arrays: PyTree) -> Result:
 def in_a_row(values: Shaped[Array, "places *rows pixels"]) -> Shaped[Array, "*rows points"]:
     rows = jnp.moveaxis(values, 0, -2)
     return rows.reshape(*rows.shape[:-2], rows.shape[-2] * rows.shape[-1])
-
-
-def _by_place(values: Shaped[Array, "*rows points"]) -> Shaped[Array, "places *rows pixels"]:
-    pixels = _splatting.TILE_SIDE**2
-    rows = values.reshape(*values.shape[:-1], values.shape[-1] // pixels, pixels)
-    return jnp.moveaxis(rows, -2, 0)

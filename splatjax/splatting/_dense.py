@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from splatjax._combination import AbstractCombination
+from splatjax._combination import DeviceMesh
 from splatjax.scene import Splats
 
 from ._grid import TileGrid
@@ -40,7 +40,7 @@ class DenseRasterPlan(AbstractRasterPlan):
         attributes: Float[Array, "attributes splats"],
         view: AbstractView,
         settings: SplattingSettings,
-        combination: AbstractCombination,
+        combination: DeviceMesh,
     ) -> FragmentSums:
         dtype, grid = attributes.dtype, TileGrid(view.width, view.height)
         columns = jnp.arange(view.width, dtype=dtype)[:, None] + 0.5

@@ -12,7 +12,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import map_chunks
-from splatjax._combination import AbstractCombination
+from splatjax._combination import DeviceMesh
 from splatjax._records import record, valid
 from splatjax.scene import Splats, even_directions
 
@@ -143,15 +143,11 @@ class Sightlines(eqx.Module):
         directions = np.concatenate([lines, -lines]).astype(centers.dtype)
         return cls(jnp.asarray(directions), jnp.asarray(seen.T), size)
 
-    def first_splats(self) -> Int[Array, " groups"]:
-        """Return the first splat of each group of this device."""
-        return jnp.arange(len(self.seen), dtype=jnp.int32) * self.size
-
     def irradiance(
         self,
         exitance: Float[Array, "channels groups"],
         normals: Float[Array, "splats 3"],
-        combination: AbstractCombination,
+        combination: DeviceMesh,
     ) -> Float[Array, "channels splats"]:
         r"""Compute the irradiance from a body that radiates equally in all directions,
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks, rounded_up
-from splatjax._combination import AbstractCombination, extreme
+from splatjax._combination import DeviceMesh, extreme
 from splatjax._records import record, valid
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats, rotation_towards
@@ -104,7 +104,7 @@ class Bounds(eqx.Module):
 
     @classmethod
     @jit_unless_traced
-    def of(cls, splats: Splats, combination: AbstractCombination) -> "Bounds":
+    def of(cls, splats: Splats, combination: DeviceMesh) -> "Bounds":
         """Enclose the splats of all parts. Splats without a radius are padding and do not count."""
         exists = splats.radii > 0
         high, low = (
@@ -230,7 +230,7 @@ def make_shadow_map(
     view: AbstractView,
     splatting: SplattingSettings,
     plan: AbstractRasterPlan,
-    combination: AbstractCombination,
+    combination: DeviceMesh,
     splats_per_disc: int = 1,
 ) -> ShadowMap:
     """Render a shadow map (4.1): the surfaces visible from a light, by passes 2 and 3 of the

@@ -9,7 +9,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._chunking import AT_ONCE, zeros_after
-from splatjax._combination import AbstractCombination
+from splatjax._combination import DeviceMesh
 from splatjax.scene import Splats
 
 from ._grid import TILE_SIDE, TileGrid
@@ -114,7 +114,7 @@ class VisibleSurfaces(eqx.Module):
         sums: FragmentSums,
         view: AbstractView,
         settings: SplattingSettings,
-        combination: AbstractCombination,
+        combination: DeviceMesh,
     ) -> "VisibleSurfaces":
         """Combine the sums of all devices; each keeps a share of the places."""
         grid = TileGrid(view.width, view.height)
@@ -145,18 +145,11 @@ class VisibleSurfaces(eqx.Module):
     def grid(self) -> TileGrid:
         return TileGrid(self.view.width, self.view.height)
 
-    def gathered(self, combination: AbstractCombination) -> "VisibleSurfaces":
+    def gathered(self, combination: DeviceMesh) -> "VisibleSurfaces":
         """Return the places of all devices, without the rows of their sums."""
         sums = PixelSums(self.sums.rows[:, :0], self.sums.weights)
         places = combination.gather((self.tiles, self.in_front, sums, self.share))
         return VisibleSurfaces(self.view, *places, self.needed)
-
-    def points(
-        self, tiles: Int[Array, " some"], depth: Float[Array, "some pixels"]
-    ) -> Float[Array, "some 3 pixels"]:
-        """Compute the points (mm) that pixels see at a depth (mm). Differentiable."""
-        x, y = (index.astype(depth.dtype) + 0.5 for index in self.grid.columns_and_rows(tiles))
-        return jnp.moveaxis(self.view.unproject(x, y, depth), 0, 1)
 
     def front_picture(
         self, values: Float[Array, "places *rows pixels"], fill: float = 0.0
@@ -193,7 +186,7 @@ def visible_surfaces(
     view: AbstractView,
     settings: SplattingSettings,
     plan: AbstractRasterPlan,
-    combination: AbstractCombination,
+    combination: DeviceMesh,
 ) -> VisibleSurfaces:
     r"""Find the visible surfaces and sum the attributes of their splats (passes 2 and 3).
 

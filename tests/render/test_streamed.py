@@ -24,7 +24,7 @@ from bodies import (
 
 import splatjax as sj
 from splatjax.diffusion._clusters import LayerSources
-from splatjax.render._statistics import StreamStatistics
+from splatjax.render._statistics import measure_stream
 
 ROUNDING = 3e-5  # of the largest number of its kind: sums of a thousand terms, in another order
 LAYERS = 2.5e-2  # 99% of the pixels; at points here and at splats there, with clusters of each part
@@ -125,12 +125,10 @@ def test_sizes_are_those_of_all_splats_that_have_an_area(splats, size, begins_ba
     areas = np.random.default_rng(3).permutation(np.geomspace(0.1, 10.0, splats.count))
     given = jnp.asarray(np.where(bare, 0.0, areas), float)
     cloud = eqx.tree_at(lambda each: each.areas, splats, given)
-    found = StreamStatistics.of(streamed_in_parts(cloud, size))
-    assert found.fine == pytest.approx(
-        np.quantile(areas[~bare], sj.diffusion.FINE_QUANTILE), rel=1e-5
-    )
-    assert found.spacing == pytest.approx(np.mean(areas[~bare]) ** 0.5, rel=1e-5)
-    assert 0 < found.unevenness < 1
+    *_, spacing, fine, unevenness, _ = measure_stream(streamed_in_parts(cloud, size))
+    assert fine == pytest.approx(np.quantile(areas[~bare], sj.diffusion.FINE_QUANTILE), rel=1e-5)
+    assert spacing == pytest.approx(np.mean(areas[~bare]) ** 0.5, rel=1e-5)
+    assert 0 < unevenness < 1
 
 
 @pytest.mark.parametrize("are_all", [pytest.param(False, marks=pytest.mark.long, id="first"), True])
