@@ -171,8 +171,8 @@ def with_spare(
     """
     capacity = rounded_up(int(count * spare) + 1, step, per_octave)
     least = int(count * min(spare, _LEAST_SPARE)) + 1
-    kind = kind, step, per_octave, spare
-    return reuse_capacity(kind, least, capacity, most=1 + max(1 / per_octave, 0.25))
+    most = 1 + max(1 / per_octave, 0.25)
+    return reuse_capacity((kind, step, per_octave, spare), least, capacity, most)
 
 
 def needed_over_planned(needed: Int[Array, ""], planned: int) -> Float[Array, ""]:

@@ -223,8 +223,8 @@ def layer_sums(
     per_mm = units_per_mm(variances)
     centers = below.centers.reshape(3, -1, SOURCES_PER_BLOCK) * per_mm[layers][None, :, None]
     light = below.areas[None] * jnp.pad(below.irradiance, ((0, 1), (0, 0)), constant_values=1)
-    rows = light.reshape(len(light), -1, SOURCES_PER_BLOCK)
-    table = SourceTable(tuple(centers), tuple(rows), moments)
+    light = light.reshape(len(light), -1, SOURCES_PER_BLOCK)
+    table = SourceTable(tuple(centers), tuple(light), moments)
     points = per_mm[:, None, None, None] * points[None]
     return gaussian_sums(points, table, lists, kernels, at, forward_mode)
 

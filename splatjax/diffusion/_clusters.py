@@ -65,8 +65,7 @@ class LayerSources(eqx.Module):
         count = SOURCES_PER_BLOCK * len(layers)
         capacity = max(-(-count // half), -(-3 * len(edges) // 2)) * half
         capacity = reuse_capacity(("sources", len(exists), len(edges)), count, capacity)
-        lacking = capacity // SOURCES_PER_BLOCK - len(layers)
-        layers = np.pad(layers, (0, lacking))
+        layers = np.pad(layers, (0, capacity // SOURCES_PER_BLOCK - len(layers)))
         return cls(jnp.asarray(parents, jnp.int32), jnp.asarray(layers, jnp.int32))
 
     @jit_unless_traced

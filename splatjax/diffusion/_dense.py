@@ -92,8 +92,5 @@ def dense_layer(
         layer = layer_values(sums, jnp.zeros_like(points.T), 1 / variance[None], flat)
         return jax.tree.map(lambda rows: jnp.moveaxis(rows, -1, 0), layer)
 
-    if sources.areas.shape[0] == 0 or points.shape[1] == 0:
-        rows, count = sources.irradiance.shape[0] + 1, points.shape[1]
-        return LayerValues(*(jnp.zeros((rows, *x, count), points.dtype) for x in ((), (3,))))
     layer = map_chunks(evaluate, points.T, at_once=_AT_ONCE)
     return jax.tree.map(lambda rows: jnp.moveaxis(rows, 0, -1), layer)

@@ -125,7 +125,7 @@ class Hierarchy(eqx.Module):
 
         **Arguments:**
 
-        - `centers`: in a compact order, `padded_count` of them.
+        - `centers`: in a compact order, padded to complete clusters of all levels.
         - `exists`: false for padding.
         - `opening`: radius of a cluster over its distance, at most; with 0 all splats are near.
         - `least`: least distance of a cluster, mm: nearer ones are within reach of the softening.
@@ -157,19 +157,11 @@ class Hierarchy(eqx.Module):
         )
 
 
-def padded_count(count: int) -> int:
-    """Pad a number of splats to complete clusters of all levels."""
-    return -(-count // SIZES[-1]) * SIZES[-1]
-
-
 def padded(rows: PyTree[Array]) -> PyTree[Array]:
     """Append zeros along the last axis, the splats, to complete clusters of all levels."""
 
-    def with_zeros(row):
-        count = row.shape[-1]
-        return jnp.pad(row, [(0, 0)] * (row.ndim - 1) + [(0, padded_count(count) - count)])
-
-    return jax.tree.map(with_zeros, rows)
+    lacking = -jax.tree.leaves(rows)[0].shape[-1] % SIZES[-1]
+    return jax.tree.map(lambda row: jnp.pad(row, [(0, 0)] * (row.ndim - 1) + [(0, lacking)]), rows)
 
 
 def cluster_totals(rows: Float[Array, "*rows splats"]) -> Float[Array, "*rows clusters"]:

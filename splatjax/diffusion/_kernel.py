@@ -212,8 +212,7 @@ class EscapeNormalization(AbstractDiffusionKernel):
         variance = variances.reshape(*variances.shape, *[1] * (energies.ndim - variances.ndim))
         mean_variance = jnp.sum(energies * variance, axis=0) / jnp.maximum(leaves, _TINY_ENERGY)
         diffuses = jnp.sum(energies, axis=0) > _TINY_ENERGY
-        squared_rate = absorbed / jnp.where(diffuses, mean_variance, 1.0)
-        squared = squared_rate[None] * variance
+        squared = (absorbed / jnp.where(diffuses, mean_variance, 1.0))[None] * variance
         decay = jnp.sqrt(jnp.maximum(squared, _TINY_ENERGY))
 
         # The curvature in the same unit, by the greatest mass of all layers not wider. Not by
@@ -221,8 +220,8 @@ class EscapeNormalization(AbstractDiffusionKernel):
         greatest = jnp.ones_like(variance * mass)
         layers = (jax.lax.split(rows, [1] * len(mass)) for rows in (variance, mass))
         for layer_variance, layer_mass in zip(*layers, strict=True):
-            counts = (layer_variance <= variance) & (layer_mass > greatest)
-            greatest = jnp.where(counts, layer_mass, greatest)
+            is_narrower = layer_variance <= variance
+            greatest = jnp.where(is_narrower & (layer_mass > greatest), layer_mass, greatest)
         excess = greatest - 1
         excess = excess * excess / (excess + _ROUNDING)
         curvature = excess / (1 + excess) / max(self.depth, _SHALLOW)

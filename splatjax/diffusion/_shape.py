@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -21,7 +22,7 @@ from ._diffuser import (
     Diffused,
     LayerValues,
 )
-from ._hierarchy import Hierarchy, padded, padded_count
+from ._hierarchy import SIZES, Hierarchy, padded
 from ._rays import DiffusionCoefficients, SolvedLight, radiance_towards, scattered_once
 from ._surface_sums import SOFTENED, ScreenedKernel, SurfaceSums
 
@@ -156,7 +157,7 @@ class ShapeDiffuser(AbstractDiffuser):
             raise ValueError(
                 f"the normals of the splats bound a volume of {volume:.3g} mm^3; turn them around"
             )
-        more = padded_count(len(areas)) - len(areas)
+        more = -len(areas) % SIZES[-1]
         exists = np.pad(areas > 0, (0, more))
         least = SOFTENED * _SOFTENING * np.sqrt(np.sum(areas**2) / area)
         return Hierarchy.build(np.pad(centers, ((0, more), (0, 0))), exists, self.opening, least)
@@ -234,8 +235,10 @@ def solve(
     Systems of Linear Equations"; the iterates are those of GMRES.
     """
 
+    lengths = partial(jnp.linalg.norm, axis=1, keepdims=True)
+
     def iterate(product, right):
-        length = _lengths(right)
+        length = lengths(right)
         length = jnp.where(length > 0, length, 1.0)
         none = jnp.zeros((_MOST, *right.shape), right.dtype)
 
@@ -247,7 +250,7 @@ def solve(
                 along = jnp.einsum("msu,su->ms", images, image)
                 image = image - jnp.einsum("ms,msu->su", along, images)
                 direction = direction - jnp.einsum("ms,msu->su", along, directions)
-            size = _lengths(image)
+            size = lengths(image)
             inverse = 1 / jnp.where(size > 0, size, 1.0)
             direction, image = inverse * direction, inverse * image
             share = jnp.sum(residual * image, axis=1, keepdims=True)
@@ -256,14 +259,10 @@ def solve(
             return count + 1, solution, residual, directions, images
 
         def is_unsolved(state):
-            return (state[0] < _MOST) & (jnp.max(_lengths(state[2])) > error)
+            return (state[0] < _MOST) & (jnp.max(lengths(state[2])) > error)
 
         start = jnp.int32(0), none[0], right / length, none, none
         _, solution, residual, *_ = jax.lax.while_loop(is_unsolved, step, start)
-        return length * jnp.where(_lengths(residual) <= error, solution, jnp.nan)
+        return length * jnp.where(lengths(residual) <= error, solution, jnp.nan)
 
     return jax.lax.custom_linear_solve(product, right, iterate, iterate)
-
-
-def _lengths(rows: Float[Array, "systems unknowns"]) -> Float[Array, "systems 1"]:
-    return jnp.sqrt(jnp.sum(rows * rows, axis=1, keepdims=True))

@@ -176,9 +176,9 @@ class Passes(eqx.Module):
         splats, albedo, kernel = self.scene.splats, self.scene.splats.albedo, self.settings.kernel
         root = jnp.ones_like(direct.source) if albedo is None else _shading.albedo_root(albedo.T)
         _, roughness = surface_parameters(self.scene)
-        f0 = _shading.fresnel_f0(material.eta)
-        enters = _shading.average_transmission(f0, roughness, material.angular_law())
-        enters = enters.reshape(material.channels, -1)
+        enters = _shading.average_transmission(
+            _shading.fresnel_f0(material.eta), roughness, material.angular_law()
+        ).reshape(material.channels, -1)
         # The Gaussians also represent light that scatters once: for direct light where it leaves,
         # for bounced light where it enters.
         total, diffused = material.total_reflectance(), material.gaussians.total_reflectance()

@@ -125,10 +125,17 @@ def make_plan(
     check_planned(scenes, cameras)
     (scene, *other_scenes), cameras = _on_one_device((scenes, cameras))
     scene, other_scenes, cameras = in_one_dtype(scene, other_scenes, cameras)
-    views = [view for camera in cameras for view in _planned_views(camera)]
+    # The view of each camera, and that of the largest picture that shares its program.
+    padded = [_splatting.PerspectiveView.padded(camera) for camera in cameras]
+    larger = [
+        view.enlarged(camera)
+        for view, camera in zip(padded, cameras, strict=True)
+        if (view.width, view.height) != (camera.width, camera.height)
+    ]
     parts, order, exists = _cut_and_order(scene.splats, mesh)
     bounds, interval, splatting = _measure(parts, settings)
     gaussians = scene.material.gaussians
+    views = padded + larger
     raster = settings.rasterizer.make_plan(parts, views, settings.splatting)
     plan = Plan(
         order=order,
@@ -156,14 +163,6 @@ def make_plan(
     return jax.tree.map(
         lambda leaf, spec: jax.device_put(leaf, NamedSharding(mesh, spec)), plan, specs
     )
-
-
-def _planned_views(camera: Camera) -> list[_splatting.PerspectiveView]:
-    """Return the view of a camera, and that of the largest picture that shares its program."""
-    view = _splatting.PerspectiveView.padded(camera)
-    if (view.width, view.height) == (camera.width, camera.height):
-        return [view]
-    return [view, view.enlarged(camera)]
 
 
 def splats_per_device(count: int, mesh: Mesh | None) -> tuple[int, int]:
@@ -261,13 +260,11 @@ def arrange(
 ) -> Splats:
     """Sort a device's splats in the order of a plan; repeated ones are invisible and dark."""
     placed = jax.tree.map(lambda leaf: leaf[order], splats)
-
-    def masked(leaf):
-        where = np.where if isinstance(leaf, np.ndarray) else jnp.where
-        return where(exists.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
-
+    where = np.where if isinstance(placed.radii, np.ndarray) else jnp.where
     return eqx.tree_at(
-        lambda splats: (splats.normals, splats.radii, splats.areas), placed, replace_fn=masked
+        lambda splats: (splats.normals, splats.radii, splats.areas),
+        placed,
+        replace_fn=lambda leaf: where(exists.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0),
     )
 
 

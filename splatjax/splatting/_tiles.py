@@ -128,8 +128,7 @@ class TilePlan(AbstractRasterPlan):
         seen = min(1 << plan.splats.bit_length(), joined.count)
         coarse = TilePlan(self.rasterizer, seen, 1 << plan.pairs.bit_length(), every_tile)
         most = max(int(_tiles_behind(joined, view, settings, coarse)) for view in views)
-        step = -(-grid.half // 8)
-        grain = math.lcm(self.rasterizer.lanes * step, len(parts))
+        grain = math.lcm(self.rasterizer.lanes * -(-grid.half // 8), len(parts))
         capacity = -(-int(_SPARE * most + 1) // grain) * grain
         behind = reuse_capacity(("behind", grid, grain), int(1.25 * most) + 1, capacity, most=2.0)
         return dataclasses.replace(self, places=SurfaceCapacity(self.places.front, behind))
