@@ -92,8 +92,7 @@ class LayerSources(eqx.Module):
         start = list(jnp.zeros(shape, splats.areas.dtype))
         light = splats.irradiance.swapaxes(0, 1) if own_light else None
         (areas, *rows), _ = jax.lax.scan(add_layer, start, (self.parents, depths, light))
-        inverse = 1 / jnp.where(areas > 0, areas, 1.0)
-        means = jnp.stack(rows) * inverse[None]
+        means = jnp.stack(rows) / jnp.where(areas > 0, areas, 1.0)[None]
         return Sources(means[:3], None, areas, means[3:])
 
 

@@ -73,7 +73,7 @@ def dense_layer(
 ) -> LayerValues:
     """Evaluate one layer at any points, untruncated."""
     # Sink the sources below their splats.
-    below = sources.centers - depth * sources.normals
+    below = sources.centers - depth * sources.normals  # ty: ignore[unsupported-operator]
 
     def evaluate(points: Float[Array, "points 3"]):
         # Squared distances of all points from all sources.

@@ -126,16 +126,15 @@ def make_plan(
     (scene, *other_scenes), cameras = _on_one_device((scenes, cameras))
     scene, other_scenes, cameras = in_one_dtype(scene, other_scenes, cameras)
     # The view of each camera, and that of the largest picture that shares its program.
-    padded = [_splatting.PerspectiveView.padded(camera) for camera in cameras]
-    larger = [
+    views = [_splatting.PerspectiveView.padded(camera) for camera in cameras]
+    views += [
         view.enlarged(camera)
-        for view, camera in zip(padded, cameras, strict=True)
+        for view, camera in zip(views, cameras, strict=True)
         if (view.width, view.height) != (camera.width, camera.height)
     ]
     parts, order, exists = _cut_and_order(scene.splats, mesh)
     bounds, interval, splatting = _measure(parts, settings)
     gaussians = scene.material.gaussians
-    views = padded + larger
     raster = settings.rasterizer.make_plan(parts, views, settings.splatting)
     plan = Plan(
         order=order,
