@@ -3,7 +3,7 @@
 import json
 import struct
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,8 +19,10 @@ from ._trimesh import one_sentence
 _Pose: TypeAlias = Float[np.ndarray, "4 4"]
 _Lens: TypeAlias = Mapping[str, Any]
 _Found: TypeAlias = Iterator[tuple[str, _Lens, _Pose]]
-_Image: TypeAlias = tuple[str, int, list[float]]  # name, camera, quaternion and translation
+# Cameras: number, model, width, height, parameters; images: quaternion, translation, camera, name.
+_Rows: TypeAlias = tuple[Sequence[Sequence[Any]], Sequence[Sequence[Any]]]
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
+_DISTORTED = "with distortion; undistort the pictures first, such as by `colmap image_undistorter`"
 _SQUARE = 1e-2  # largest error at the edge of a picture due to unequal focal lengths, pixels
 _ROWS = 512  # rows of a picture, because glTF does not specify its size
 _LIGHTS = "KHR_lights_punctual"
@@ -57,14 +59,15 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
     """
     path, cameras = Path(path), {}
     check_units(path, mm_per_unit, up)
-    readers = {".json": _transforms, ".gltf": _gltf, ".glb": _gltf}
-    reader = _colmap if path.is_dir() else readers.get(existing_file(path).suffix.lower())
-    if reader is None:
-        raise ValueError(
-            f"{path}: is not a file of cameras; give transforms.json, glTF, or a folder of COLMAP"
-        )
+    kind = "folder" if path.is_dir() else existing_file(path).suffix.lower()
+    readers = {"folder": _colmap, ".json": _transforms, ".gltf": _gltf, ".glb": _gltf}
+    require(
+        kind in readers,
+        path,
+        "is not a file of cameras; give transforms.json, glTF, or a folder of COLMAP",
+    )
     with one_sentence(path):
-        for name, lens, pose in reader(path):
+        for name, lens, pose in readers[kind](path):
             name = f"{name} {len(cameras)}" if name in cameras else name
             cameras[name] = _camera(f"{path}: {name}", lens, pose, mm_per_unit, up)
     require(cameras, path, "has no perspective camera; export it with its cameras")
@@ -86,8 +89,7 @@ def load_camera(path: StrPath, name: str = "0", *, mm_per_unit: float, up: str =
 
 def resized(camera: Camera, height: int) -> Camera:
     """Return a camera with another number of rows, and columns in proportion."""
-    width = round(camera.width * height / camera.height)
-    return replace(camera, width=width, height=height)
+    return replace(camera, width=round(camera.width * height / camera.height), height=height)
 
 
 def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -> Camera:
@@ -99,8 +101,11 @@ def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -
     """
     model = lens.get("camera_model", "PINHOLE")
     bent = [f"{name} = {lens[name]}" for name in _DISTORTION if lens.get(name)]
-    if bent or model not in _MODELS:
-        raise _has_distortion(where, ", ".join([model, *bent]))
+    require(
+        model in _MODELS and not bent,
+        where,
+        f"its lens is {', '.join([model, *bent])}, {_DISTORTED}",
+    )
     require(
         lens.keys() >= {"w", "h", "fl_x"},
         where,
@@ -132,13 +137,6 @@ def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -
     )
 
 
-def _has_distortion(where: str | Path, lens: str) -> ValueError:
-    return ValueError(
-        f"{where}: its lens is {lens}, with distortion; undistort the pictures first, such as by "
-        "`colmap image_undistorter`"
-    )
-
-
 def _transforms(path: Path) -> _Found:
     content = json.loads(path.read_text(encoding="utf-8"))
     for index, frame in enumerate(content["frames"]):
@@ -154,50 +152,50 @@ def _colmap(path: Path) -> _Found:
     from trimesh.transformations import quaternion_matrix  # takes a second
 
     is_binary = (path / "images.bin").exists() and not (path / "images.txt").exists()
-    lenses, images = (_colmap_binary if is_binary else _colmap_text)(path)
-    for name, camera, pose in images:
-        to_camera = quaternion_matrix(pose[:4])
-        to_camera[:3, 3] = pose[4:]
-        yield name, lenses[camera], np.linalg.inv(to_camera)
-
-
-def _colmap_text(path: Path) -> tuple[dict[int, _Lens], list[_Image]]:
-    lenses, images = {}, []
-    for line in _lines(path / "cameras.txt"):
-        number, model, width, height, *values = line.split()
+    cameras, images = (_colmap_binary if is_binary else _colmap_text)(path)
+    lenses = {}
+    for number, model, width, height, *values in cameras:
         parameters = zip(_MODELS.get(model, ()), map(float, values), strict=False)
         lenses[int(number)] = {"camera_model": model, "w": width, "h": height, **dict(parameters)}
-    for line in _lines(path / "images.txt")[::2]:  # the lines between list the points of each image
-        _, *pose, camera, name = line.split(maxsplit=9)
-        images.append((name, int(camera), [*map(float, pose)]))
-    return lenses, images
+    for *pose, camera, name in images:
+        place = np.asarray(pose, float)
+        to_camera = quaternion_matrix(place[:4])
+        to_camera[:3, 3] = place[4:]
+        yield name, lenses[int(camera)], np.linalg.inv(to_camera)
 
 
-def _colmap_binary(path: Path) -> tuple[dict[int, _Lens], list[_Image]]:
-    lenses, images, models = {}, [], [*_MODELS]
+def _colmap_text(path: Path) -> _Rows:
+    cameras = [line.split() for line in _lines(path / "cameras.txt")]
+    # The lines between those of images list the points of each image.
+    return cameras, [line.split(maxsplit=9)[1:] for line in _lines(path / "images.txt")[::2]]
+
+
+def _colmap_binary(path: Path) -> _Rows:
+    cameras, images, models = [], [], [*_MODELS]
     data, at = existing_file(path / "cameras.bin").read_bytes(), 8
     for _ in range(*struct.unpack_from("<Q", data)):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
-        if not 0 <= model < len(models):
-            raise _has_distortion(path / "cameras.bin", f"COLMAP's model {model}")
-        names = _MODELS[models[model]]
-        values = struct.unpack_from(f"<{len(names)}d", data, at + 24)
-        lenses[number] = {"camera_model": models[model], "w": width, "h": height}
-        lenses[number] |= zip(names, values, strict=True)
-        at += 24 + 8 * len(names)
+        require(
+            0 <= model < len(models),
+            path / "cameras.bin",
+            f"its lens is COLMAP's model {model}, {_DISTORTED}",
+        )
+        values = struct.unpack_from(f"<{len(_MODELS[models[model]])}d", data, at + 24)
+        cameras.append((number, models[model], width, height, *values))
+        at += 24 + 8 * len(values)
     data, at = (path / "images.bin").read_bytes(), 8
     for _ in range(*struct.unpack_from("<Q", data)):
         _, *pose, camera = struct.unpack_from("<i7di", data, at)
         end = data.index(b"\0", at + 64)
-        images.append((data[at + 64 : end].decode(), camera, pose))
+        images.append((*pose, camera, data[at + 64 : end].decode()))
         (points,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9 + 24 * points
-    return lenses, images
+    return cameras, images
 
 
 def _lines(path: Path) -> list[str]:
-    lines = existing_file(path).read_text(encoding="utf-8").rstrip().split("\n")
-    return [line for line in lines if not line.startswith("#")]
+    text = existing_file(path).read_text(encoding="utf-8").rstrip()
+    return [line for line in text.split("\n") if not line.startswith("#")]
 
 
 def _gltf(path: Path) -> _Found:
