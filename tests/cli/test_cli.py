@@ -174,8 +174,8 @@ def test_the_number_of_splats_that_would_resolve_a_layer_is_noted(capsys):
 
     def fraction(count):
         scene = sj.Scene(bodies.sphere(count, 20.0, jitter=1.0), light, material)
-        frame = sj.render(scene, camera)
-        note_unresolved(frame, scene, sj.RenderSettings().kernel, count)
+        frame = sj.render(scene, camera, bodies.PLAIN)
+        note_unresolved(frame, scene, bodies.PLAIN.kernel, count)
         return float(frame.unresolved_fraction[0])
 
     assert fraction(800) > 0.9
@@ -216,7 +216,7 @@ def test_a_material_of_one_channel_has_three(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.once
-def test_wavelengths_have_color_under_an_illuminant(tmp_path, capsys):
+def test_wavelengths_have_color_under_an_illuminant(plain, tmp_path, capsys):
     """And in an environment, which lights all of them alike; in the scene of the picture too."""
     nodes, path = [450.0, 530.0, 600.0, 650.0], tmp_path / "four.exr"
     material = sj.Material(sj.SumOfGaussians([0.5], [[0.1, 0.2, 0.5, 0.6]]), wavelengths=nodes)
@@ -237,21 +237,6 @@ def test_wavelengths_have_color_under_an_illuminant(tmp_path, capsys):
     np.testing.assert_array_equal(over[covered], np.insert(picture[covered], 3, 255, axis=-1))
 
 
-@pytest.mark.slow
-@pytest.mark.long
-def test_render_without_scattering_is_lambertian(tmp_path):
-    splats, output = plate(tmp_path / "plate.ply"), tmp_path / "plate.exr"
-    words = """--width 32 --height 32 --azimuth 0 --light-azimuth 0 --light-elevation 60 --fill 0
-        --material marble --no-scattering --output"""
-    assert run("render", splats, *words.split(), output) == 0
-    frame = sj.read_exr(output)
-    total = np.asarray(sj.load_material("marble").gaussians.total_reflectance())
-    # Radiance is reflectance x irradiance / pi, with irradiance pi cos 60 degrees; the interface
-    # takes and gives a few per cent.
-    np.testing.assert_allclose(np.asarray(frame.diffuse)[16, 16], 0.5 * total, rtol=0.03)
-    np.testing.assert_allclose(np.asarray(frame.weights), total[None], rtol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("given", "kinds"),
     [
@@ -270,10 +255,10 @@ def test_a_studio_lights_where_no_light_is_given(given, kinds):
 
 
 @pytest.mark.parametrize(("width", "height"), [(64, 64), (128, 64), (64, 128)])
-def test_camera_frames_the_bounding_sphere_at_any_scale(width, height):
+def test_camera_frames_the_bounding_sphere_at_any_scale_with_the_fill_beside_it(width, height):
     places = 40 * bodies.unit(np.random.default_rng(3).normal(size=(500, 3))) + [5.0, -20.0, 3.0]
     splats = bodies.splats(places, np.tile([0.0, 0.0, 1.0], (500, 1)), 1.0)
-    options = Render(width=width, height=height, elevation=20.0)
+    options = Render(width=width, height=height, elevation=20.0, fill=0.1)
     camera = options.camera(lambda: [splats], 30.0)
     local = (places - np.asarray(camera.position)) @ np.asarray(camera.rotation).T
     across, along = (local[:, :2] / local[:, 2:] * float(camera.focal_length)).T
@@ -281,6 +266,15 @@ def test_camera_frames_the_bounding_sphere_at_any_scale(width, height):
     small = options.camera(lambda: [splats.scaled(0.2)], 30.0)
     np.testing.assert_allclose(small.position, 0.2 * camera.position, rtol=1e-4)
     np.testing.assert_allclose(small.rotation, camera.rotation, atol=1e-5)
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2
+    distances, fills = [], []
+    for azimuth in (30.0, 70.0, 190.0):
+        camera = options.camera(lambda: [splats], azimuth)
+        _, fill = options.lights(sj.load_material("marble"), azimuth, -20.0)
+        distances.append(np.linalg.norm(np.asarray(camera.position) - middle))
+        fills.append(np.asarray(camera.rotation @ fill.direction))
+    np.testing.assert_allclose(distances, distances[0], rtol=1e-5)
+    np.testing.assert_allclose(fills, fills[:1] * 3, atol=1e-5)
 
 
 @pytest.mark.parametrize(

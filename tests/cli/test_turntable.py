@@ -86,22 +86,6 @@ def test_a_full_turn_does_not_repeat(turn, degrees, camera_step, light_step):
     assert [options.azimuths(i) for i in range(5)] == expected
 
 
-def test_camera_keeps_its_distance_and_the_fill_its_place_beside_it():
-    places = np.random.default_rng(3).normal(size=(50, 3)) * np.asarray([30.0, 10.0, 5.0]) + 20
-    splats = bodies.splats(places, np.ones((50, 3)), 1.0)
-    middle = (places.min(axis=0) + places.max(axis=0)) / 2
-    options, marble = Turntable(elevation=20.0, fill=0.1), sj.load_material("marble")
-    azimuths = np.arange(0.0, 360.0, 40.0).tolist()
-    cameras = [options.camera(lambda: [splats], azimuth) for azimuth in azimuths]
-    distances = [np.linalg.norm(np.asarray(camera.position) - middle) for camera in cameras]
-    fills = [
-        np.asarray(camera.rotation @ options.lights(marble, azimuth, -20.0)[1].direction)
-        for camera, azimuth in zip(cameras, azimuths, strict=True)
-    ]
-    np.testing.assert_allclose(distances, distances[0], rtol=1e-5)
-    np.testing.assert_allclose(fills, np.broadcast_to(fills[0], (9, 3)), atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("error", "status"), [(KeyboardInterrupt(), 130), (OSError(28, "No space left", "a.png"), 2)]
 )
