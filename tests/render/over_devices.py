@@ -55,27 +55,13 @@ def pictured(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan):
 
 
 def splats_cut() -> dict:
-    return _apart_on_eight(scene())
-
-
-def strata_cut() -> dict:
-    """Environment and area light, seen and differentiated in the light alone."""
+    """Under lights with shadows, of one sample and of several."""
     lights = (
+        *scene().lights,
         sj.EnvironmentLight(np.random.default_rng(4).uniform(0.1, 2.0, (6, 12, 3)), count=5),
         sj.scene.RectangleLight(LAMP, 6.0, [[0, 0, 20], [0, 20, 0]], count=3),
     )
-    bare, eye = scene(), camera()
-
-    def found(mesh):
-        plan = sj.make_plan(replace(bare, lights=lights), eye, TILED, mesh=mesh)
-
-        def loss(lights):
-            frame = sj.render(replace(bare, lights=lights), eye, TILED, plan)
-            return jnp.mean(frame.beauty**2), frame
-
-        return eqx.filter_jit(eqx.filter_grad(loss, has_aux=True))(lights)
-
-    return apart(found(None), found(jax.make_mesh((8,), ("splats",))))
+    return _apart_on_eight(replace(scene(), lights=lights))
 
 
 # Gradients without a shadow map: it takes half the time to compile.

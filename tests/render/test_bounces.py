@@ -87,18 +87,6 @@ def test_a_cup_has_the_exact_series(material, angle):
 
 
 @pytest.mark.once
-def test_in_an_open_cup_the_first_bounce_is_even():
-    """Under parallel light too: the mean exitance times the form factor."""
-    body = cup(70)
-    direct, bounced = (received(sj.Scene(body, SUN, MATTE), bounces) for bounces in (0, 1))
-    gained = bounced - direct
-    share = (1 - np.cos(np.radians(70))) / 2
-    exact = np.asarray(MATTE.total_reflectance()) * direct.mean(axis=1) * share
-    np.testing.assert_allclose(gained.mean(axis=1), exact, rtol=0.05)  # a long rim
-    assert np.all(np.std(gained, axis=1) < 0.05 * exact)
-
-
-@pytest.mark.once
 def test_a_convex_body_receives_nothing_of_itself():
     body = sphere(COUNT)
     scene = sj.Scene(body, (SUN, LAMP), MATTE)

@@ -35,7 +35,6 @@ def on_eight(question):
     "question",
     [
         "light_and_unshadowed_splats_cut",
-        pytest.param("strata_cut", marks=pytest.mark.long),
         pytest.param("splats_cut", marks=pytest.mark.long),
         pytest.param("more_than_pictures_cut", marks=pytest.mark.long),
         pytest.param("views_cut", marks=pytest.mark.long),

@@ -3,11 +3,11 @@ material of separate layers, reciprocity, energy, gradients, refusals.
 """
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from bodies import (
     PLAIN,
     assert_close,
@@ -77,24 +77,6 @@ def test_light_goes_both_ways_alike_between_stripes_and_none_is_added():
         assert np.all(exitance(WHITE, replace(body, weights=parted), i).sum((0, 1)) < 1)
 
 
-def test_weights_that_cannot_be_combined_are_refused():
-    body, light = sphere(90, 4.0, jitter=0.0), lights_from_two_sides()
-    medium = sj.Medium([0.02, 0.05], [0.9, 1.2], 1.3)
-    material = replace(WHITE, medium=medium)
-    solved = replace(PLAIN, diffuser=ShapeDiffuser())
-    single = replace(WHITE, single_scattering=sj.SingleScattering(medium))
-    for factors, given, settings, words in (
-        (np.ones((3, 2)), WHITE, PLAIN, "splats.weights.*3 Gaussians.*2"),
-        (np.ones((2, 3)), WHITE, PLAIN, "splats.weights has 3 channels"),
-        (np.ones((2, 2)), single, PLAIN, "single scattering.*splats.weights"),
-        (np.ones((2, 2)), material, solved, "splats.weights.*ShapeDiffuser"),
-    ):
-        of = sj.Scene(with_factors(body, factors), light, given)
-        assert_refused(partial(sj.render, of, view(), settings), words)
-    negative = partial(with_factors, body, -np.ones((2, 2)))
-    assert_refused(negative, r"Splats.weights must be.*-1")
-
-
 SUMMED = replace(PLAIN, diffuser=ExitanceDiffuser(DenseDiffuser()))
 ERROR = 1e-2  # of the largest value: the gain is blended instead of the mass that it depends on
 
@@ -130,6 +112,43 @@ def test_with_gain_the_picture_is_that_of_separate_layers_within_a_thin_sheet():
     assert error < ERROR * expected.max() < 0.1 * gain
 
 
+def factored(factors, material=WHITE, settings=PLAIN):
+    """Render with factors of the weights of every splat."""
+    of = sj.Scene(with_factors(sphere(90, 4.0), factors), lights_from_two_sides(), material)
+    return sj.render(of, view(), settings)
+
+
+def of_a_sum(function, *light):
+    of = scene(sphere(100))
+    return function(of, *light, view(), SUMMED, sj.make_plan(of, view(), SUMMED))
+
+
+MEDIUM = sj.Medium([0.02, 0.05], [0.9, 1.2], 1.3)
+SINGLE = replace(WHITE, single_scattering=sj.SingleScattering(MEDIUM))
+SOLVED = replace(WHITE, medium=MEDIUM), replace(PLAIN, diffuser=ShapeDiffuser())
+ONES = np.ones((2, 2))
+REFUSED = [
+    (lambda: factored(np.ones((3, 2))), "splats.weights.*3 Gaussians.*2"),
+    (lambda: factored(np.ones((2, 3))), "splats.weights has 3 channels"),
+    (lambda: factored(ONES, SINGLE), "single scattering.*splats.weights"),
+    (lambda: factored(ONES, *SOLVED), "splats.weights.*ShapeDiffuser"),
+    (lambda: factored(-ONES), r"Splats.weights must be.*-1"),
+    (lambda: of_a_sum(sj.diffusion_basis), "DenseDiffuser"),
+    (lambda: of_a_sum(sj.picture_jacobian), "DenseDiffuser"),
+    (
+        lambda: of_a_sum(sj.diffuse_irradiance, jnp.ones((100, 3))),
+        "ExitanceDiffuser has no separate layers",
+    ),
+    (lambda: ExitanceDiffuser(ShapeDiffuser()), "layers is a ShapeDiffuser"),
+    (lambda: ExitanceDiffuser(ExitanceDiffuser()), "layers is a ExitanceDiffuser"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), REFUSED)
+def test_what_cannot_be_combined_or_separated_is_refused(call, message):
+    assert_refused(call, message)
+
+
 def test_summed_layers_have_their_derivatives(float64):
     of = scene(sphere(100))
     plan = sj.make_plan(of, view(size=8), SUMMED)
@@ -142,15 +161,3 @@ def test_summed_layers_have_their_derivatives(float64):
     gaussians = of.material.gaussians
     given = of.splats.centers, of.splats.albedo, gaussians.weights, gaussians.variances
     check_grads(jax.jit(beauty), given, 1, ["rev"], atol=1e-5, rtol=1e-5, eps=1e-6)
-
-
-def test_separate_layers_of_a_sum_are_refused():
-    of = scene(sphere(100))
-    plan = sj.make_plan(of, view(), SUMMED)
-    for render in (sj.diffusion_basis, sj.picture_jacobian):
-        assert_refused(partial(render, of, view(), SUMMED, plan), "DenseDiffuser")
-    diffuse = partial(sj.diffuse_irradiance, of, jnp.ones((100, 3)), view(), SUMMED, plan)
-    assert_refused(diffuse, "ExitanceDiffuser has no separate layers")
-    for diffuser in (ShapeDiffuser(), ExitanceDiffuser()):
-        message = rf"layers is a {type(diffuser).__name__}"
-        assert_refused(partial(ExitanceDiffuser, diffuser), message)
