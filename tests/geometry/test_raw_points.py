@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from bodies import unit
-from scipy.spatial import cKDTree
 
 from splatjax.geometry import bust_mesh, complete_splats, estimate_normals
 from splatjax.geometry._scatter import scatter
@@ -33,14 +32,6 @@ def test_two_bodies_are_each_turned_outward():
     ball = unit(np.random.default_rng(0).normal(size=(800, 3)))
     both = np.concatenate([ball, ball + np.asarray([10.0, 0.0, 0.0])])
     assert (agreement(both, np.tile(ball, (2, 1))) > 0).all()
-
-
-def test_given_fields_are_kept():
-    ball, radii = np.random.default_rng(0).normal(size=(50, 3)), np.linspace(1, 2, 50)
-    splats = complete_splats(ball, radii=radii)
-    _, near = cKDTree(splats.centers).query(ball)
-    assert len(np.unique(near)) == 50
-    np.testing.assert_allclose(np.asarray(splats.radii)[near], radii, rtol=1e-6)
 
 
 def plane(count=900, spacing=1.0, seed=0):

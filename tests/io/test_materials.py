@@ -3,7 +3,6 @@
 import runpy
 import tomllib
 from pathlib import Path
-from xml.etree import ElementTree
 
 import equinox as eqx
 import jax
@@ -21,10 +20,8 @@ from splatjax.io import (
     load_profile,
     profiles_folder,
     save_material,
-    save_materialx,
     spectrum_to_rgb,
     surface_and_source,
-    write_toml,
 )
 from splatjax.io._tables import Table
 from splatjax.scattering import (
@@ -307,7 +304,8 @@ def test_a_bad_file_is_refused_by_table_entry_and_value(tmp_path, text, value):
 def test_the_subsurface_of_openpbr_comes_in_with_its_defaults_and_its_color_goes_out(tmp_path):
     path, color = tmp_path / "wax.toml", [0.05, 0.6, 0.98]
     text = f'[openpbr]\nunit = "cm"\nsubsurface_color = {color}\nsubsurface_radius = 0.2\n'
-    path.write_text(text + "subsurface_scatter_anisotropy = 0.5\n", encoding="utf-8")
+    text += "subsurface_scatter_anisotropy = 0.5\nspecular_weight = 0.7\nspecular_roughness = 0.4\n"
+    path.write_text(text, encoding="utf-8")
     medium, g = load_medium(path), load_mean_cosine(path)
     assert g == 0.5
     np.testing.assert_allclose(medium.eta, 1.5)
@@ -318,26 +316,10 @@ def test_the_subsurface_of_openpbr_comes_in_with_its_defaults_and_its_color_goes
         for sigma_a in (medium.sigma_a, 0 * medium.sigma_a)
     )
     np.testing.assert_allclose(found / white, color, rtol=1e-3)
-
-
-def test_an_exported_openpbr_surface_comes_back_with_its_highlight(tmp_path):
-    """Its inputs, as [openpbr], give its surface and coefficients; [surface] takes precedence."""
-    marble = load_material("marble")
-    surface = {"eta": marble.eta, "specular": 0.7, "roughness": 0.16}
-    material = sj.Material(marble.gaussians, medium=marble.medium, **surface)
-    save_materialx(tmp_path / "it.mtlx", material)
-    inputs = ElementTree.parse(tmp_path / "it.mtlx").find("open_pbr_surface").findall("input")
-    numbers = {i.get("name"): [*map(float, i.get("value").split(","))] for i in inputs}
-    entries = {name: v if len(v) > 1 else v[0] for name, v in numbers.items()}
-    write_toml(tmp_path / "it.toml", {"openpbr": {"unit": "mm", **entries}})
-    found, _ = surface_and_source(tmp_path / "it.toml")
-    np.testing.assert_allclose([found["specular"], found["roughness"]], [0.7, 0.16], rtol=1e-6)
-    medium = load_medium(tmp_path / "it.toml")
-    np.testing.assert_allclose(medium.sigma_s_prime, marble.medium.sigma_s_prime, rtol=1e-3)
-    write_toml(
-        tmp_path / "it.toml", {"openpbr": {"unit": "mm", **entries}, "surface": {"roughness": 0.5}}
-    )
-    assert surface_and_source(tmp_path / "it.toml")[0]["roughness"] == 0.5
+    surface, _ = surface_and_source(path)
+    np.testing.assert_allclose([surface["specular"], surface["roughness"]], [0.7, 0.16], rtol=1e-6)
+    path.write_text(f"{text}[surface]\nroughness = 0.5\n", encoding="utf-8")
+    assert surface_and_source(path)[0]["roughness"] == 0.5  # which takes precedence
 
 
 @pytest.mark.parametrize(

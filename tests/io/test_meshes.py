@@ -174,9 +174,18 @@ def points_of(body):
     return KDTree(points), HARD_BODIES[body].face_normals[faces]
 
 
-@pytest.mark.parametrize("rounded", [True, False])
-@pytest.mark.parametrize("kind", [*SUFFIXES, "smooth ply", "smooth obj", "smooth glb"])
-@pytest.mark.parametrize("body", HARD_BODIES)
+@pytest.mark.parametrize(
+    ("body", "kind", "rounded"),
+    [
+        *(("box", kind, True) for kind in (*SUFFIXES, "smooth ply", "smooth obj", "smooth glb")),
+        *(
+            (body, kind, rounded)
+            for body in ("cylinder", "plate with a rib")
+            for kind in ("obj", "smooth glb")
+            for rounded in (True, False)
+        ),
+    ],
+)
 def test_normals_end_at_hard_edges(tmp_path, body, kind, rounded):
     """Files without normals, and files whose normals are the mean of all faces around a vertex. At
     edges and corners splats, seen up to 0.8 of their radius, reach 0.7 spacings beyond at most.
