@@ -1,4 +1,4 @@
-"""Where spectra become color: white, illuminants, and pictures of spectra."""
+"""Where spectra become color: white, illuminants, the skin locus, and pictures of spectra."""
 
 import subprocess
 import sys
@@ -8,12 +8,23 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import PLAIN, assert_refused, camera_over, sheet
+from bodies import PLAIN, assert_refused, camera_over, sheet, sphere, view
 from PIL import Image
 
 import splatjax as sj
 
 WAVELENGTHS = np.arange(400, 701, 10)
+# Median lightness of each band of ten, and the 5th and 95th percentile of a* and b* under D65: 5500
+# spectra of hands, arms and foreheads in the International Skin Spectra Archive (Lu et al. 2025,
+# Scientific Data, doi 10.1038/s41597-025-04857-5).
+LIGHTNESS = [28.7, 35.5, 46.9, 56.3, 63.1, 70.7]
+LOCUS = {
+    "a": ([4.8, 7.3, 7.9, 6.8, 4.5, 3.7], [7.8, 12.3, 13.9, 14.8, 12.9, 7.5]),
+    "b": ([4.8, 7.6, 14.9, 14.5, 12.0, 10.0], [8.7, 17.3, 22.1, 22.5, 20.5, 15.8]),
+}
+NEAR = 0.1  # the eye sees a difference of one or two
+SURFACE = (0.5 / 2.5) ** 2  # what an index of 1.5 reflects along the normal
+SIX = [0.02, 0.04, 0.07, 0.11, 0.17, 0.26]  # melanin from light to dark
 
 
 def tristimulus(reflectance, illuminant):
@@ -39,6 +50,77 @@ def test_white_is_white_and_red_is_red(illuminant):
     np.testing.assert_allclose(np.full(31, 0.3) @ matrix, 0.3, rtol=1e-12)
     red = (WAVELENGTHS > 600) @ matrix
     assert red[0] > 0.6 > 0.2 > red[1]
+
+
+def test_colors_are_those_of_colour_science():
+    import colour
+
+    shape = colour.SpectralShape(380, 780, 1)
+    spectrum = colour.SDS_COLOURCHECKERS["ISO 17321-1"]["light skin"]
+    aligned, observer, daylight = (
+        each.copy().align(shape)
+        for each in (
+            spectrum,
+            colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"],
+            colour.SDS_ILLUMINANTS["D65"],
+        )
+    )
+    xyz = colour.sd_to_XYZ(aligned, observer, daylight, method="Integration") / 100
+    expected = colour.XYZ_to_sRGB(xyz, apply_cctf_encoding=False)
+    found = spectrum.values @ sj.io.spectrum_to_rgb(spectrum.wavelengths)
+    np.testing.assert_allclose(found, expected, rtol=5e-3)
+
+
+def test_six_skins_descend_along_the_locus():
+    import colour
+
+    spectra = np.stack(
+        [sj.scattering.Skin(melanin).half_space().total_reflectance() for melanin in SIX]
+    )
+    rgb = (SURFACE + (1 - SURFACE) * spectra) @ sj.io.spectrum_to_rgb(WAVELENGTHS)
+    assert np.all(np.diff(rgb, axis=0) < 0)
+    assert np.all(np.diff(rgb, axis=1) < 0)  # red above green above blue
+    lab = colour.XYZ_to_Lab(colour.sRGB_to_XYZ(rgb, apply_cctf_decoding=False))
+    for found, bounds in zip(lab.T[1:], LOCUS.values(), strict=True):
+        low, high = (np.interp(lab[:, 0], LIGHTNESS, bound) for bound in bounds)
+        np.testing.assert_allclose(found, np.clip(found, low, high), rtol=0, atol=NEAR)
+
+
+@pytest.mark.once
+@pytest.mark.parametrize(
+    ("melanin", "lamp", "error"), [(0.02, "A", 1.7), (0.1, "LED-B1", 6.6), (0.26, "FL11", 4.4)]
+)
+def test_weights_for_daylight_are_off_under_a_lamp(melanin, lamp, error):
+    """By the Delta E of docs/howto/fit.md, to an eye adapted to the lamp."""
+    import colour
+
+    to_rgb = colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB
+    tables = colour.SDS_ILLUMINANTS[lamp], colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    shape = colour.SpectralShape(380, 780, 1)
+    light, observer = (each.copy().align(shape).values for each in tables)
+    white = light @ observer
+    spectrum = np.asarray(sj.scattering.Skin(melanin).half_space().total_reflectance())
+    rgb = (spectrum @ sj.io.spectrum_to_rgb(WAVELENGTHS, name) for name in ("D65", lamp))
+    xyz = (np.linalg.solve(to_rgb, each * (to_rgb @ white / white[1])) for each in rgb)
+    lab = (colour.XYZ_to_Lab(each, colour.XYZ_to_xy(white)) for each in xyz)
+    np.testing.assert_allclose(colour.delta_E(*lab, method="CIE 2000"), error, atol=0.1)
+
+
+def test_a_projected_picture_is_the_picture_of_projected_weights():
+    """Where the kernel has gain 1."""
+    body, matrix = sphere(200), sj.io.spectrum_to_rgb(WAVELENGTHS)
+    weights = 0.2 * np.random.default_rng(0).random((2, 31))
+    settings = replace(PLAIN, kernel=sj.diffusion.PlainMean())
+    light = sj.DirectionalLight([-0.5, -0.4, -1.0], 3.0)
+
+    def picture(weights):
+        material = sj.Material(sj.SumOfGaussians([0.5, 9.0], weights), specular=0.0)
+        return np.asarray(sj.render(sj.Scene(body, light, material), view(), settings).beauty)
+
+    # Black channels beside three: one program renders both pictures.
+    three = picture(np.pad(weights @ matrix, ((0, 0), (0, 28))))[..., :3]
+    assert three.max() > 0.1
+    np.testing.assert_allclose(picture(weights) @ matrix, three, atol=1e-5)
 
 
 @pytest.fixture(scope="module")

@@ -80,6 +80,19 @@ def test_irradiance_on_a_ball_is_that_of_the_harmonic_bands(count, is_even):
     assert np.max(np.abs(error)) < largest
 
 
+@pytest.mark.long
+@pytest.mark.once
+def test_an_environment_of_one_pixel_is_a_directional_light():
+    image = np.zeros((32, 64, 3))
+    image[9, 40] = [100, 200, 300]
+    toward, strip = map_directions(32)[9, 40], np.diff(np.cos(np.pi * np.asarray([10, 9]) / 32))
+    lamp = sj.DirectionalLight(-toward, image[9, 40] * strip * np.pi / 32)
+    ours, lamps = (render(light, BODY, GLOSSY) for light in (sj.EnvironmentLight(image), lamp))
+    assert np.max(apart(ours.diffuse, lamps.diffuse)[""]) < 2e-3
+    assert float(np.sum(ours.specular) / np.sum(lamps.specular)) == pytest.approx(1, abs=0.05)
+    assert apart(ours.shadow, lamps.shadow)[""] < 5e-3
+
+
 @pytest.mark.once
 def test_an_environment_is_the_sum_of_its_samples_in_every_layer():
     """Its shadow is theirs, weighted by the light that each would bring to the sheet."""

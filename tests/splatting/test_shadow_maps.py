@@ -1,5 +1,5 @@
-"""Shadow maps: a disc above a plane, a sphere that must not shadow itself, and splats that
-are merged.
+"""Shadow maps: a disc above a plane, a sphere that must not shadow itself, and the gradient of a
+soft edge.
 """
 
 import dataclasses
@@ -156,14 +156,30 @@ def test_umbra_is_dark_and_the_rest_is_lit(kind):
 
 
 @pytest.mark.once
-def test_a_map_no_finer_than_its_splats_shows_the_whole_shadow():
-    (body, floor), blocked = scene(), {}
+def test_the_shadow_of_an_open_edge_ends_within_half_a_spacing():
+    spacing, height = 0.25, 5.0
+    blocker = bodies.sheet(3.0, spacing, center=(-3.0 - spacing / 2, 0.0, height))  # to x = 0
+    line = np.linspace(-2, 2, 161)
+    floor = np.stack(np.meshgrid(line, np.arange(-2.0, 2.0, 0.2), 0.0), axis=-1).reshape(-1, 3)
+    floor = bodies.splats(floor, np.tile([0.0, 0.0, 1.0], (len(floor), 1)), 1.5 * spacing)
+    body, settings = bodies.joined(blocker, floor), ShadowSettings(resolution=256)
+    view = distant_view(jnp.asarray([0.0, 0.0, -1.0]), bounds_of(body), settings)
+    visible = visibility(body, view, plan_for(view, body), settings)[blocker.count :]
+    edge = 2 - np.trapezoid(np.mean(np.reshape(visible, (-1, len(line))), axis=0), line)
+    assert 0 < edge < 0.5 * spacing  # 0.6 if discs block light as they cover pixels
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e3])
+def test_a_map_no_finer_than_its_splats_shows_the_whole_shadow(scale):
+    body, floor = scene()
+    body, blocked = body.scaled(scale), {}
     for settings in (ShadowSettings(), ShadowSettings(pixels_per_spacing=np.inf)):
-        settings = settings.for_spacing(1.0, bounds_of(body))
+        settings = settings.for_spacing(scale, bounds_of(body))
         view = distant_view(jnp.asarray([0.3, 0.1, -1.0]), bounds_of(body), settings)
         visible = visibility(body, view, plan_for(view, body), settings)[:floor]
         shadow = np.sum((1 - np.asarray(visible, float)) * np.asarray(body.areas[:floor], float))
-        blocked[int(settings.side)] = shadow
+        blocked[int(settings.side)] = shadow / scale**2
     assert list(blocked) == [192, 1024]
     # The disc's shadow extends by half a spacing of its splats.
     expected = np.pi * (RADIUS + 0.25) ** 2
@@ -213,6 +229,22 @@ def test_light_that_grazes_a_smooth_body_leaves_no_terraces():
     grazed = (cosine > 0.13) & (cosine < 0.2)
     assert np.mean(visible[grazed]) > 0.99  # 0.97 if the plane is followed to 1/4
     assert np.min(visible[cosine > 0.2]) > 0.999
+
+
+def test_edge_has_the_gradient_of_central_differences(float64):
+    """In the direction of the light, and in where the occluder stands."""
+    body, floor = scene()
+    bounds, weights = bounds_of(body), np.random.default_rng(3).normal(size=floor)
+    start = jnp.asarray([0.3, 0.1, -1.0]), jnp.asarray([0.05, -0.03, 0.2])
+    plan = plan_for(distant_view(start[0], bounds, SETTINGS), body)
+
+    @jax.jit
+    def total(direction, shift):
+        moved = dataclasses.replace(body, centers=body.centers.at[floor:].add(shift[None]))
+        view = distant_view(direction, bounds, SETTINGS)
+        return jnp.vdot(visibility(moved, view, plan)[:floor], weights)
+
+    check_grads(total, start, 1, ["rev"], atol=1e-5, rtol=1e-5, eps=1e-6)
 
 
 def test_merged_splats_have_the_area_of_each_side():
