@@ -168,9 +168,10 @@ def main() -> None:
     part = sj.inverse.NormalOffsets(step=0.1, smoothness=6.0, deviation=1.5)
     tables = part.prepared(splats)
     x = jnp.asarray(
-        rng.normal(size=splats.count) * 1.5 / part.step / float(tables.gain), jnp.float32
+        rng.normal(size=splats.count) * 1.5 / part.step / float(tables.mean.gain), jnp.float32
     )
-    bumpy = part.moved(splats, x, tables)
+    pictured = sj.inverse._observation.PicturedScene(splats, camera, tuple(lights))
+    bumpy = part.moved(pictured, x, tables).splats
 
     def of_shape(body, cameras, lights):
         return (

@@ -85,12 +85,11 @@ FROM_HEAD = (250, 100, 800), (0, 70, 0), 19, 683_549
 BUST, FROM_BUST = "the built-in bust", ((250, 0, 800), (0, -40, 0), 22, 300_000)
 EAR = (450, 80, 300), (60, 60, 0), 9, 683_549
 STUDIO = sj.EnvironmentLight(sj.scene.studio())
-LIKE_KEY = "lit like the studio's large softbox"
 KEY = lamp(0.41, -0.574, -0.709)  # from the studio's large softbox
 BEHIND = sj.EnvironmentLight(np.roll(sj.scene.studio(), len(sj.scene.studio()), axis=1))
 BODIES = [
     Body("sphere", f"{SPHERE}, lit from the side", sphere, lamp(-1, -1, -1), *FROM_SPHERE),
-    Body("sphere_key", f"{SPHERE}, {LIKE_KEY}", sphere, KEY, *FROM_SPHERE),
+    Body("sphere_key", f"{SPHERE}, lit like the studio's large softbox", sphere, KEY, *FROM_SPHERE),
     Body("sphere_studio", f"{SPHERE} in the studio", sphere, STUDIO, *FROM_SPHERE),
     Body(
         "sphere_refracting",
@@ -155,7 +154,7 @@ BODIES = [
         eta=1.4,
     ),
     Body("head", f"{HEAD}, lit from the front", head, lamp(-0.7, -0.5, -1), *FROM_HEAD),
-    Body("head_key", f"{HEAD}, {LIKE_KEY}", head, KEY, *FROM_HEAD),
+    Body("head_key", f"{HEAD}, lit like the studio's large softbox", head, KEY, *FROM_HEAD),
     Body("head_studio", f"{HEAD} in the studio", head, STUDIO, *FROM_HEAD),
     Body("head_refracting", f"{HEAD} in the studio, eta 1.4", head, STUDIO, *FROM_HEAD, eta=1.4),
     Body(
@@ -273,11 +272,10 @@ def fitted(profile: sj.gaussians.AbstractProfile, eta: float) -> sj.Material:
     highlight.
     """
     weights = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
-    rule = sj.fitting.TransportModel.rule
     with jax.enable_x64(True):
         profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), profile)
-        gaussians = sj.fit_gaussians(profile, 6, weights=weights, rule=rule).gaussians
-    gaussians = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), gaussians)
+        fit = sj.fit_gaussians(profile, 6, weights=weights, rule=sj.fitting.TransportModel.rule)
+    gaussians = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), fit.gaussians)
     return sj.Material(gaussians, eta=eta, specular=0.0, roughness=0.05)
 
 

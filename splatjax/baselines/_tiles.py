@@ -24,7 +24,6 @@ from splatjax.splatting import (
     PixelSums,
     SplattingSettings,
     TileGrid,
-    TileRanges,
     TileRasterizer,
     bin_items,
     plan_pairs,
@@ -85,8 +84,7 @@ class ListPlan(AbstractRasterPlan):
     ) -> FragmentSums:
         grid = TileGrid(view.width, view.height)
         footprints = self.rasterizer.kernel.footprints(splats, view, settings)
-        ranges = TileRanges.of(footprints.box, footprints.visible, grid)
-        bins = bin_items(ranges, grid, self.pairs)
+        bins = bin_items(footprints.ranges(grid), grid, self.pairs)
         lengths = grid.blocks(bins.counts[bins.order[:: grid.lanes]])
         ends = jnp.concatenate([running(jnp.add, lengths), jnp.full(1, self.blocks, jnp.int32)])
         block = jnp.arange(self.blocks, dtype=jnp.int32)
@@ -158,5 +156,4 @@ def _demand(
     kernel: AbstractSplatKernel, splats: Splats, view: AbstractView, settings: SplattingSettings
 ):
     grid = TileGrid(view.width, view.height)
-    footprints = kernel.footprints(splats, view, settings)
-    return TileRanges.of(footprints.box, footprints.visible, grid).per_tile(grid)
+    return kernel.footprints(splats, view, settings).ranges(grid).per_tile(grid)

@@ -24,7 +24,7 @@ from splatjax.scene import Splats
 
 from ._bins import bin_items, plan_pairs
 from ._fragments import NUMBERS, PartSweep
-from ._grid import TileGrid, TileRanges
+from ._grid import TileGrid
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, SurfaceCapacity
 from ._sweeps import sum_tile_fragments
 from ._views import AbstractView, SplattingSettings
@@ -63,9 +63,8 @@ class TileRasterizer(AbstractRasterizer):
         self, splats: Splats, view: AbstractView, settings: SplattingSettings
     ) -> tuple[Array, Int[Array, " tiles"]]:
         """Count the splats that may be visible, and the splats of every tile."""
-        footprints, grid = view.footprints(splats, settings), self.grid(view)
-        ranges = TileRanges.of(footprints.box, footprints.visible, grid)
-        return jnp.sum(view.may_see(splats)), ranges.per_tile(grid)
+        ranges = view.footprints(splats, settings).ranges(self.grid(view))
+        return jnp.sum(view.may_see(splats)), ranges.per_tile(self.grid(view))
 
     def plan_for(
         self,
@@ -174,7 +173,7 @@ class TilePlan(AbstractRasterPlan):
         return (
             (type(view), grid, settings.filter_radius),
             settings.hidden_from.astype(splats.centers.dtype),
-            bin_items(TileRanges.of(footprints.box, footprints.visible, grid), grid, self.pairs),
+            bin_items(footprints.ranges(grid), grid, self.pairs),
             jax.lax.stop_gradient(footprints.shift),
             tuple(getattr(footprints, name) for name in NUMBERS),
             attributes,

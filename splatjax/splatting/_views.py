@@ -20,6 +20,8 @@ from jaxtyping import Array, Bool, Float
 from splatjax._records import record, valid
 from splatjax.scene import Splats
 
+from ._grid import TileGrid, TileRanges
+
 # Cosine to the line of sight, below which float32 cannot determine the visible side of a splat.
 EDGE_ON = 1e-5
 _SLOPE_FILTER = 0.25  # pixels; see `widen_ellipse`
@@ -116,6 +118,10 @@ class Footprints(eqx.Module):
     opacity: Float[Array, " splats"]
     box: tuple[Float[Array, " splats"], ...]
     visible: Bool[Array, " splats"]
+
+    def ranges(self, grid: TileGrid) -> TileRanges:
+        """Find the tiles that each splat may touch."""
+        return TileRanges.of(self.box, self.visible, grid)
 
 
 def widen_ellipse(
