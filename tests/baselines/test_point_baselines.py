@@ -1,5 +1,5 @@
 """What each point-based method is known for: flat points, aliasing, holes, curved normals; and that
-none invents a color. What the law of Figure 5 says of numbers of splats.
+none invents a color. The law of Figure 5 on the number of splats.
 """
 
 import dataclasses
