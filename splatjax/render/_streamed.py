@@ -268,7 +268,8 @@ def _shade(
     interval: Float[Array, "2"],
     settings: RenderSettings,
 ) -> Frame:
-    def shade_places(samples: SurfaceSamples):
+    def shade_places(samples: SurfaceSamples, layers):
+        samples = dataclasses.replace(samples, layers=layers)
         attributes = settings.lighting.at_pixels(scene, groups, samples)
         shaded, _ = shade(
             scene,
@@ -282,5 +283,4 @@ def _shade(
         )
         return shaded
 
-    samples = dataclasses.replace(samples, layers=layers)
-    return compose(scene, map_places(shade_places, samples), visible)
+    return compose(scene, map_places(shade_places, samples, layers), visible)
