@@ -55,7 +55,7 @@ class ShapeDiffuser(AbstractDiffuser):
 
     The material needs a `Medium`; its Gaussians and single scattering are not used. The splats
     should be spread evenly, at most about a mean free path apart. The time is proportional to their
-    number: 65 microseconds for each and three channels.
+    number: 0.1 ms of processor time for each and three channels.
 
     **Attributes:**
 
