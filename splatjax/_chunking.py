@@ -21,7 +21,12 @@ _LEAST_SPARE = 1.1
 _LONGEST_DOUBLED = 1 << 19  # here both ways take as long to run
 
 
-def map_chunks(function: Callable[..., Result], *arrays: PyTree, at_once: int = AT_ONCE) -> Result:
+def map_chunks(
+    function: Callable[..., Result],
+    *arrays: PyTree,
+    at_once: int = AT_ONCE,
+    used: Bool[Array, " length"] | None = None,
+) -> Result:
     r"""Apply a pointwise function to chunks of arrays, one after the other, and join the results.
 
     Arrays of at most one chunk are computed directly. For longer ones, no intermediate array is
@@ -34,6 +39,8 @@ def map_chunks(function: Callable[..., Result], *arrays: PyTree, at_once: int = 
       on what the function closes over.
     - `arrays`: trees of arrays, all of one length. Differentiable as the function is.
     - `at_once`: the largest length of a chunk.
+    - `used`: the elements whose results are used. Of several chunks, those without any are not
+      computed, and their results are 0. All for `None`.
 
     **Returns:** `function(*arrays)`.
     """
@@ -56,8 +63,20 @@ def map_chunks(function: Callable[..., Result], *arrays: PyTree, at_once: int = 
     def compute(chunk):
         return jax.tree.map(_planes, function(*_vectors(chunk)))
 
+    def compute_used(chunk):
+        arrays, used = chunk
+        if used is None:
+            return compute(arrays)
+        result = jax.eval_shape(compute, arrays)
+        return jax.lax.cond(
+            jnp.any(used),
+            compute,
+            lambda _: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), result),
+            arrays,
+        )
+
     results = jax.lax.map(
-        jax.checkpoint(compute), jax.tree.map(split, jax.tree.map(_planes, arrays))
+        jax.checkpoint(compute_used), jax.tree.map(split, (jax.tree.map(_planes, arrays), used))
     )
     return _vectors(
         jax.tree.map(lambda leaf: leaf.reshape(chunks * size, *leaf.shape[2:])[:length], results)
@@ -164,14 +183,20 @@ def rounded_up(count: int, step: int, per_octave: int = 8) -> int:
 
 
 def with_spare(
-    kind: Hashable, count: int, step: int, per_octave: int = 8, spare: float = 1.03
+    kind: Hashable, count: int, step: int, per_octave: int = 8, spare: float = 1.03, cheap: int = 0
 ) -> int:
     """Plan the capacity of a kind of array for a count: `spare` times as many and at least one
     more, rounded up; or one planned before that has at least 10% to spare, or as much as that.
+
+    **Arguments:**
+
+    - `cheap`: a capacity that takes hardly any time. Up to it, twice the count is planned, and all
+      that was planned is reused, so that other bodies in small pictures need no other program.
     """
-    capacity = rounded_up(int(count * spare) + 1, step, per_octave)
+    planned = max(int(count * spare), min(2 * count, cheap)) + 1
+    capacity = rounded_up(planned, step, per_octave)
     least = int(count * min(spare, _LEAST_SPARE)) + 1
-    most = 1 + max(1 / per_octave, 0.25)
+    most = max(1 + 1 / per_octave, 1.25, cheap / capacity)
     return reuse_capacity((kind, step, per_octave, spare), least, capacity, most)
 
 

@@ -43,6 +43,21 @@ def test_parts_give_what_the_whole_gives(at_once):
     np.testing.assert_allclose(along(parts), along(whole), **close)
 
 
+def test_a_chunk_that_is_not_used_is_not_computed():
+    numbers = jnp.asarray([0.0, 0.0, 4.0, 2.0, 0.0, 0.0])
+
+    @jax.jit
+    @jax.value_and_grad
+    def total(scale):
+        return jnp.sum(
+            map_chunks(lambda part: scale / part, numbers, at_once=2, used=numbers > 0)
+        )
+
+    value, derivative = total(2.0)
+    assert value == 1.5
+    assert derivative == 0.75
+
+
 def test_zeros_wait_for_what_must_be_known_and_are_zeros_whatever_it_is():
     make = jax.jit(lambda known: zeros_after(known, (2, 3), jnp.float32))
     for known in (-1.0, 0.0, 5.0, np.nan, np.inf):

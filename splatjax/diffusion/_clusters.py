@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._chunking import jit_unless_traced
-from splatjax.cache import reuse_capacity
+from splatjax._chunking import jit_unless_traced, with_spare
 
 from ._diffuser import Sources
 
 POINTS_PER_BLOCK = 32  # blocks, and their halves and quarters, are compact
 SOURCES_PER_BLOCK = 8
+_CHEAP = 1 << 15  # blocks of sources that take hardly any time
 _TOGETHER = 128 * POINTS_PER_BLOCK  # size of parts that are then halved together
 
 
@@ -43,8 +43,7 @@ class LayerSources(eqx.Module):
     ) -> "LayerSources":
         """Choose the sources of layers.
 
-        The capacity is three quarters of the splats for every layer. Most materials need less, and
-        so share a program.
+        The capacity is rounded up, so that similar bodies and materials share a program.
 
         **Arguments:**
 
@@ -61,11 +60,9 @@ class LayerSources(eqx.Module):
         blocks = -(-np.asarray(counts) // SOURCES_PER_BLOCK)
         layers, ends = np.repeat(np.arange(len(edges)), blocks), np.cumsum(blocks)
         parents = np.stack(cells_of_splats) + SOURCES_PER_BLOCK * (ends - blocks)[:, None]
-        half = -(-len(exists) // (2 * SOURCES_PER_BLOCK)) * SOURCES_PER_BLOCK
-        count = SOURCES_PER_BLOCK * len(layers)
-        capacity = max(-(-count // half), -(-3 * len(edges) // 2)) * half
-        capacity = reuse_capacity(("sources", len(exists), len(edges)), count, capacity)
-        layers = np.pad(layers, (0, capacity // SOURCES_PER_BLOCK - len(layers)))
+        most = len(edges) * -(-len(exists) // SOURCES_PER_BLOCK)
+        planned = with_spare(("sources", most), len(layers), 256, cheap=_CHEAP)
+        layers = np.pad(layers, (0, min(planned, most) - len(layers)))
         return cls(jnp.asarray(parents, jnp.int32), jnp.asarray(layers, jnp.int32))
 
     @jit_unless_traced

@@ -272,7 +272,11 @@ class Passes(eqx.Module):
             return map_places(shade_and_read, samples)
 
         values = map_chunks(
-            sample_and_read, visible.sums, visible.tiles, at_once=2 * _splatting.TILES_AT_ONCE
+            sample_and_read,
+            visible.sums,
+            visible.tiles,
+            at_once=2 * _splatting.TILES_AT_ONCE,
+            used=visible.tiles < visible.grid.count,
         )
         return self.combination.gather(values), visible.gathered(self.combination)
 

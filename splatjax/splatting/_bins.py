@@ -19,6 +19,7 @@ from ._grid import TILE_BITS, TileGrid, TileRanges
 
 _ROW_BITS = 32 - TILE_BITS  # of a sort key: the number of a pair in its row
 _ROW = 1 << _ROW_BITS  # pairs sorted together
+_CHEAP = 1 << 18  # pairs that are sorted in a few milliseconds
 
 
 def plan_pairs(
@@ -26,7 +27,7 @@ def plan_pairs(
 ) -> int:
     """Choose the capacity of pairs of item and tile for each of these numbers of items per tile."""
     pairs = max(int(np.asarray(tiles, np.int64).sum()) for tiles in per_tile)
-    return with_spare(("pairs", grid), max(pairs, 1), _ROW, per_octave=2, spare=spare)
+    return with_spare(("pairs", grid), max(pairs, 1), _ROW, 2, spare, _CHEAP)
 
 
 class Bins(eqx.Module):

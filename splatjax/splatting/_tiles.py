@@ -30,7 +30,8 @@ from ._sweeps import sum_tile_fragments
 from ._views import AbstractView, SplattingSettings
 
 _STEP = 1024  # least step to which the planned number of splats is rounded up
-_SPARE = 1.5  # planned tiles with a surface behind, over the number found by planning
+_CHEAP = 4096  # tiles that take hardly any time where there is no surface
+_SPARE = 2.0  # planned tiles with a surface behind, over the number found by planning
 
 
 class TileRasterizer(AbstractRasterizer):
@@ -87,7 +88,7 @@ class TileRasterizer(AbstractRasterizer):
         ]
         most = max(int(np.sum(tiles)) for tiles in touched)
         step = self.lanes * -(-grid.half // 2)
-        front = with_spare(("front", grid), most, step, spare=self.spare)
+        front = with_spare(("front", grid), most, step, spare=self.spare, cheap=_CHEAP)
         grain = math.lcm(self.lanes, devices)
         front = min(max(front, self.lanes * grid.half), grid.padded_count)
         front = -(-front // grain) * grain
@@ -129,7 +130,8 @@ class TilePlan(AbstractRasterPlan):
         most = max(int(_tiles_behind(joined, view, settings, coarse)) for view in views)
         grain = math.lcm(self.rasterizer.lanes * -(-grid.half // 8), len(parts))
         capacity = -(-int(_SPARE * most + 1) // grain) * grain
-        behind = reuse_capacity(("behind", grid, grain), int(1.25 * most) + 1, capacity, most=2.0)
+        cheap = max(2.0, _CHEAP / capacity)
+        behind = reuse_capacity(("behind", grid, grain), int(1.25 * most) + 1, capacity, cheap)
         return dataclasses.replace(self, places=SurfaceCapacity(self.places.front, behind))
 
     def choose(
