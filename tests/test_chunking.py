@@ -49,9 +49,7 @@ def test_a_chunk_that_is_not_used_is_not_computed():
     @jax.jit
     @jax.value_and_grad
     def total(scale):
-        return jnp.sum(
-            map_chunks(lambda part: scale / part, numbers, at_once=2, used=numbers > 0)
-        )
+        return jnp.sum(map_chunks(lambda part: scale / part, numbers, at_once=2, used=numbers > 0))
 
     value, derivative = total(2.0)
     assert value == 1.5
