@@ -59,11 +59,19 @@ class Interactions(eqx.Module):
         points: PyTree[Array],
         sources: PyTree[Array],
         combine: Callable = jax.ops.segment_sum,
+        used: Bool[Array, " points"] | None = None,
     ) -> Float[Array, "results points"]:
         """Apply a function to planes of points `[rows, 1, points]` and of sources `[rows, sources,
         1]`, and combine each of its results, `[rows, points]`. Absent sources are 0.
+
+        **Arguments:**
+
+        - `used`: the points whose results are used; all for `None`.
         """
         blocks = jax.tree.leaves(points)[0].shape[-1] // POINTS_PER_BLOCK
+        if used is not None:  # of the rows
+            of_blocks = jnp.any(used.reshape(blocks, -1), axis=1)
+            used = of_blocks.at[self.points].get(mode="fill", fill_value=False)
         # Read before the loop, so that the derivative adds to the sources once.
         x = jax.tree.map(lambda leaf: _read(leaf, self.points[:, None], POINTS_PER_BLOCK), points)
         y = jax.tree.map(lambda leaf: _read(leaf, self.sources, self.block), sources)
@@ -72,7 +80,7 @@ class Interactions(eqx.Module):
             x = jax.tree.map(lambda plane: plane[:, None], x)
             return function(x, jax.tree.map(lambda plane: plane[:, :, None], y))
 
-        rows = jnp.stack(map_chunks(of_rows, x, y, at_once=_ROWS), axis=1)
+        rows = jnp.stack(map_chunks(of_rows, x, y, at_once=_ROWS, used=used), axis=1)
         combined = combine(rows, self.points, blocks, indices_are_sorted=True)
         return jnp.swapaxes(combined, 0, 1).reshape(combined.shape[1], -1)
 
@@ -103,13 +111,14 @@ class Hierarchy(eqx.Module):
         *,
         combine: Callable = jax.ops.segment_sum,
         join: Callable = jnp.add,
+        used: Bool[Array, " points"] | None = None,
     ) -> Float[Array, "results points"]:
         """Combine `near` of near splats and `far` of clusters, as `Interactions.reduce`, and join
         the results: sums by default.
         """
         return join(
-            self.near.reduce(near, points, splats, combine),
-            self.far.reduce(far, points, clusters, combine),
+            self.near.reduce(near, points, splats, combine, used),
+            self.far.reduce(far, points, clusters, combine, used),
         )
 
     @classmethod

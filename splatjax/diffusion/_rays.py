@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from splatjax._smooth import mean_decay
 from splatjax.scattering import ExactFresnel, Medium
@@ -91,16 +91,30 @@ def scattered_once(
     )
     centers, normals = surface.centers, surface.normals
 
+    same = jnp.all(beams.directions[:, None] == beams.directions[None], axis=(2, 3))
+    first_of = jnp.argmax(same, axis=0)  # the first channel with the directions of each channel
+    channels, starts = jnp.arange(len(first_of)), jnp.any(beams.irradiance > 0, axis=0)
+
+    def exits(rows):
+        all_rows = jnp.concatenate([rows, normals])
+
+        def follow(directions):
+            length, cosine, ends = surface.first_exits(directions, starts, all_rows)
+            return jnp.stack([length, cosine, dot(ends[len(rows) :], normals)]), ends[: len(rows)]
+
+        def of_channel(channel):
+            directions, is_first = channel
+            none = jnp.zeros((3, len(starts)), rows.dtype), jnp.zeros_like(rows)
+            return jax.lax.cond(is_first, follow, lambda _: none, directions)
+
+        ends, at_ends = jax.lax.map(of_channel, (beams.directions, first_of == channels))
+        return at_ends[first_of, channels], ends[first_of]
+
+    _, to_exits, ends = jax.vjp(exits, jnp.zeros_like(beams.irradiance), has_aux=True)
+
     def of_channel(channel):
-        medium, kappa, irradiance, directions = channel
+        medium, kappa, irradiance, directions, ends = channel
         channel_kernel = ScreenedKernel(kappa[None], kernel.length)
-
-        def exits(row):
-            rows = jnp.concatenate([row[None], normals])
-            length, cosine, rows = surface.first_exits(directions, irradiance > 0, rows)
-            return rows[0], (length, cosine, dot(rows[1:], normals))
-
-        _, to_exits, ends = jax.vjp(exits, jnp.zeros_like(irradiance), has_aux=True)
         length, exit_cosine, alike = (row[None] for row in ends)
         is_through = jnp.isfinite(length)
         length = jnp.where(is_through, length, 0.0)
@@ -115,9 +129,7 @@ def scattered_once(
         beyond = jnp.maximum(length - along, 0) * exit_cosine
         early = _leaves_early(depth, medium)
         early_beyond = jnp.where(is_through, (1 - bend) * _leaves_early(beyond, medium), 0.0)
-        leaving = jnp.sum(early * scattered, axis=0)
-        (emerging,) = to_exits(surface.areas * jnp.sum(early_beyond * scattered, axis=0))
-        leaving = leaving + emerging / jnp.where(surface.areas > 0, surface.areas, 1.0)
+        leaving, emerging = (jnp.sum(part * scattered, axis=0) for part in (early, early_beyond))
         diffuses = (1 - early - early_beyond) * scattered * medium.lasting
         # The others see the plane of beams below each splat.
         unseen = channel_kernel.plane_integral(depth[None])[0]
@@ -130,9 +142,13 @@ def scattered_once(
         total, _ = jax.lax.scan(
             jax.checkpoint(add), jnp.sum(diffuses * unseen, axis=0), (diffuses, along)
         )
-        return total / medium.diffusion_coefficient, leaving
+        return total / medium.diffusion_coefficient, leaving, surface.areas * emerging
 
-    return jax.lax.map(of_channel, (medium, kernel.kappa, beams.irradiance, beams.directions))
+    source, leaving, power = jax.lax.map(
+        of_channel, (medium, kernel.kappa, beams.irradiance, beams.directions, ends)
+    )
+    (emerging,) = to_exits(power)
+    return source, leaving + emerging / jnp.where(surface.areas > 0, surface.areas, 1.0)[None]
 
 
 def _leaves_early(
@@ -167,13 +183,15 @@ class SurfaceLight(eqx.Module):
     entering: Float[Array, "channels splats"]
     direction: Float[Array, "3 splats"]
 
-    def at_exits(self, surface: SurfaceSums, way: Float[Array, "3 splats"]):
+    def at_exits(
+        self, surface: SurfaceSums, way: Float[Array, "3 splats"], starts: Bool[Array, " splats"]
+    ):
         """Follow rays into the body: return the light at their ends, 0 for a ray without an end;
         the cosine of the exit; and the length of the ray, mm, finite for its derivative.
         """
         parts = jax.tree.leaves(self)
         rows = jnp.concatenate(parts)
-        length, cosine, rows = surface.first_exits(way, surface.areas > 0, rows)
+        length, cosine, rows = surface.first_exits(way, starts, rows)
         ends = jnp.isfinite(length)
         rows = jnp.where(ends[None], rows, 0.0)
         light = SurfaceLight(*jnp.split(rows, np.cumsum([len(part) for part in parts])[:-1]))
@@ -219,7 +237,7 @@ class SolvedLight(eqx.Module):
         light = SurfaceLight(
             fluence, flux, beams.irradiance, entering, direction=jnp.mean(directions, axis=0)
         )
-        far, _, thickness = light.at_exits(surface, -normals)
+        far, _, thickness = light.at_exits(surface, -normals, surface.areas > 0)
 
         def towards(cosine):
             mu = _inside(jnp.full_like(thickness, cosine), material.eta)
@@ -230,7 +248,11 @@ class SolvedLight(eqx.Module):
 
 
 def radiance_towards(
-    eye: Float[Array, "3"], surface: SurfaceSums, material: Material, light: SolvedLight
+    eye: Float[Array, "3"],
+    surface: SurfaceSums,
+    material: Material,
+    light: SolvedLight,
+    seen: Bool[Array, " splats"],
 ) -> Float[Array, "channels splats"]:
     r"""Compute `pi` times the radiance of splats towards an eye, without the Fresnel loss: the
     source integral along the refracted ray `w` up to its exit from the body, over its mean,
@@ -239,6 +261,10 @@ def radiance_towards(
 
     Along the surface `phi` is linear: seen from the lit side a splat is darker than M, and from the
     dark side brighter, by half beyond the terminator of a sphere.
+
+    **Arguments:**
+
+    - `seen`: the splats whose radiance is used.
     """
     coefficients, normals, eta = (
         DiffusionCoefficients.of(material.medium),
@@ -253,9 +279,9 @@ def radiance_towards(
     along = (to_eye - cosine[None] * normals) / eta
     mu = _inside(cosine, eta)
     way = -(along + mu[None] * normals)
-    far, far_mu, length = light.surface.at_exits(surface, way)
-    seen = source_integral(light.surface, far, mu, far_mu, length, coefficients)
-    shape = seen / jnp.where(light.mean > 0, light.mean, 1.0)
+    far, far_mu, length = light.surface.at_exits(surface, way, seen)
+    gathered = source_integral(light.surface, far, mu, far_mu, length, coefficients)
+    shape = gathered / jnp.where(light.mean > 0, light.mean, 1.0)
     shape = jnp.where(light.mean > 0, jnp.clip(shape, 0, _BRIGHTEST), 1.0)
     optical = jnp.minimum(length[None] * coefficients.sigma_t[:, None], _LONGEST)
     slope = jnp.sum(light.slopes * along[None], axis=1)

@@ -212,8 +212,9 @@ class ShapePlan(AbstractDiffusionPlan):
         their radiance towards the eye.
         """
         surface = SurfaceSums.of(splats, self.hierarchy)
-        seen = radiance_towards(eye, surface, material, solved)
-        return LayerValues(take_points(seen, at)[None], layers.slopes)
+        seen = jnp.zeros(splats.count, bool).at[at].set(True, mode="drop")
+        radiance = radiance_towards(eye, surface, material, solved, padded(seen))
+        return LayerValues(take_points(radiance, at)[None], layers.slopes)
 
     def diffuse(self, sources, variances, kernel, combination, at=None):
         raise ValueError(

@@ -263,11 +263,11 @@ class SurfaceSums(eqx.Module):
         means = cluster_totals(self.areas[None] * rows) / jnp.where(total > 0, total, 1.0)[None]
         rays = self.centers, directions
         starts_of = self.hierarchy.reduce(
-            first, first, rays, *discs, combine=jax.ops.segment_min, join=jnp.minimum
+            first, first, rays, *discs, combine=jax.ops.segment_min, join=jnp.minimum, used=starts
         )
         (start,) = jax.lax.stop_gradient(starts_of)
         sources = zip(discs, (rows, means), strict=True)
-        sums = self.hierarchy.reduce(blend, blend, (*rays, start), *sources)
+        sums = self.hierarchy.reduce(blend, blend, (*rays, start), *sources, used=starts)
         is_hit = starts & (sums[0] > 0)
         means = sums[1:] / jnp.where(is_hit, sums[0], 1.0)[None]
         length = jnp.where(is_hit, means[0], jnp.where(starts, jnp.inf, 0.0))

@@ -85,6 +85,16 @@ SLABS = {2.0: [[0.4787, 0.3616], [0.3148, 0.2212]], 4.0: [[0.6054, 0.4081], [0.2
 
 
 @pytest.mark.once
+def test_every_channel_has_light_of_its_own(sphere, exitance):
+    from_below = beams(sphere, -DOWN)
+    either = jax.tree.map(
+        lambda *each: jnp.stack([each[0][0], each[1][1]]), beams(sphere), from_below
+    )
+    found, below = solved(sphere, medium(), either), solved(sphere, medium(), from_below)
+    np.testing.assert_allclose(found, [exitance[0], below[1]], rtol=1e-3)
+
+
+@pytest.mark.once
 @pytest.mark.parametrize("depth", [2.0, pytest.param(4.0, marks=pytest.mark.long)])
 def test_a_slab_returns_and_lets_through_what_light_transport_does(depth):
     box = trimesh.creation.box([20, 20, depth])
