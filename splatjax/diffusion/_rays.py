@@ -71,10 +71,7 @@ class DiffusionCoefficients(eqx.Module):
 
 
 def scattered_once(
-    surface: SurfaceSums,
-    medium: DiffusionCoefficients,
-    kernel: ScreenedKernel,
-    beams: Beams,
+    surface: SurfaceSums, medium: DiffusionCoefficients, kernel: ScreenedKernel, beams: Beams
 ) -> tuple[Float[Array, "channels splats"], Float[Array, "channels splats"]]:
     """Integrate the single scattering of the beams: `(1 / D) int G Q dV` at every splat, and the
     light that leaves before it diffuses.
@@ -90,7 +87,6 @@ def scattered_once(
         jnp.asarray(x, beams.irradiance.dtype)[:, None] for x in (nodes[1] * left, left**2)
     )
     centers, normals = surface.centers, surface.normals
-
     same = jnp.all(beams.directions[:, None] == beams.directions[None], axis=(2, 3))
     first_of = jnp.argmax(same, axis=0)  # the first channel with the directions of each channel
     channels, starts = jnp.arange(len(first_of)), jnp.any(beams.irradiance > 0, axis=0)
@@ -100,15 +96,14 @@ def scattered_once(
 
         def follow(directions):
             length, cosine, ends = surface.first_exits(directions, starts, all_rows)
-            return jnp.stack([length, cosine, dot(ends[len(rows) :], normals)]), ends[: len(rows)]
+            return jnp.stack([*ends[: len(rows)], length, cosine, dot(ends[len(rows) :], normals)])
 
         def of_channel(channel):
             directions, is_first = channel
-            none = jnp.zeros((3, len(starts)), rows.dtype), jnp.zeros_like(rows)
-            return jax.lax.cond(is_first, follow, lambda _: none, directions)
+            return jax.lax.cond(is_first, follow, lambda _: jnp.zeros_like(all_rows), directions)
 
-        ends, at_ends = jax.lax.map(of_channel, (beams.directions, first_of == channels))
-        return at_ends[first_of, channels], ends[first_of]
+        ends = jax.lax.map(of_channel, (beams.directions, first_of == channels))[first_of]
+        return ends[channels, channels], ends[:, len(rows) :]
 
     _, to_exits, ends = jax.vjp(exits, jnp.zeros_like(beams.irradiance), has_aux=True)
 
@@ -254,23 +249,16 @@ def radiance_towards(
     light: SolvedLight,
     seen: Bool[Array, " splats"],
 ) -> Float[Array, "channels splats"]:
-    r"""Compute `pi` times the radiance of splats towards an eye, without the Fresnel loss: the
-    source integral along the refracted ray `w` up to its exit from the body, over its mean,
+    r"""Compute `pi` times the radiance of `seen` splats towards an eye, without the Fresnel loss:
+    the source integral along the refracted ray `w` up to its exit from the body, over its mean,
 
         L = f M / pi - sigma_s' / (4 pi sigma_t'^2) w . grad phi
 
     Along the surface `phi` is linear: seen from the lit side a splat is darker than M, and from the
     dark side brighter, by half beyond the terminator of a sphere.
-
-    **Arguments:**
-
-    - `seen`: the splats whose radiance is used.
     """
-    coefficients, normals, eta = (
-        DiffusionCoefficients.of(material.medium),
-        surface.normals,
-        material.eta,
-    )
+    coefficients = DiffusionCoefficients.of(material.medium)
+    normals, eta = surface.normals, material.eta
     to_eye = eye[:, None] - surface.centers
     # Padding is at the origin, where an eye may be.
     squared = jnp.where(surface.areas > 0, dot(to_eye, to_eye), 1.0)
