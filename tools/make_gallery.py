@@ -155,8 +155,8 @@ def jade(_: sj.Splats, side: int) -> np.ndarray:
     rims = [np.exp(-(((radius - rim) / 0.9) ** 4)) for rim in (outer - 1.4, inner + 1.4)]
     carved = np.maximum(raised, sum(rims)) * (np.abs(z) > 0.9 * half)
     vertices = np.stack([x, y, z + np.sign(z) * grain * carved], axis=-1)
-    crust = sj.Layer(sj.Medium([0.04, 0.06, 0.2], [3.0, 3.2, 3.4], 1.55), jnp.asarray(0.4))
-    stone = sj.Layer(sj.Medium([0.16, 0.022, 0.1], [0.9, 1.0, 1.1], 1.55), jnp.asarray(jnp.inf))
+    crust = sj.Layer(sj.Medium([0.3, 0.15, 0.32], [2.4, 2.5, 2.6], 1.6), jnp.asarray(0.4))
+    stone = sj.Layer(sj.Medium([0.4, 0.075, 0.21], [0.9, 1.0, 1.1], 1.6), jnp.asarray(jnp.inf))
     material = fitted(sj.LayeredMultipole([crust, stone]), 1.6, 0.9, 0.12)
     lights = (
         sun(0.5, 0.5, -1.0, 3.0, (1.0, 0.95, 0.85)),
