@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from scipy.integrate import quad, solve_bvp
 from scipy.optimize import brentq
 from scipy.special import eval_legendre, spherical_in
 
@@ -29,7 +30,7 @@ BANDS = np.asarray(
 OF_TRANSPORT = np.asarray([0.006, 0.007, 0.025, 0.055, 0.065, 0.07])
 GAUSSIANS = sj.SumOfGaussians([1.0], np.ones((1, 2)))
 MERGED, OF_SLOPES = 3e-3, 0.06  # merged sums and their gradients, root mean squares
-OF_SERIES = 2e-3  # of 2,000 splats, over the brightest
+OF_CLOSED_FORM = 1e-3  # over the brightest, or the irradiance
 
 
 def medium(albedo=ALBEDO, eta: float = 1.0) -> sj.Medium:
@@ -156,14 +157,23 @@ def test_the_size_of_body_and_coefficients_does_not_matter(sphere, exitance):
     np.testing.assert_allclose(found, exitance, atol=2e-4 * exitance.max())
 
 
-def diffused_on_sphere(albedo: float, angle: np.ndarray) -> np.ndarray:
-    """Solve for the same sources by a series in Legendre polynomials."""
+def constants(albedo: float):
+    """Return the extrapolation distance in mean free paths, the root of the absorption, the
+    fraction of light that leaves early from a depth, and Case's discrete eigenvalue.
+    """
     z_e, lost = 0.710446 / albedo, np.sqrt(1 - albedo)
 
     def early(tau):
         hopf = 0.08948 * np.exp(-2.11533 * tau) + 0.04361 * np.exp(-16.63774 * tau)
         held = np.polyval([25.38, -24.39, 13.76, 0, 1], lost)
         return held * hopf / (tau + z_e)
+
+    return z_e, lost, early, brentq(lambda k: albedo * np.arctanh(k) - k, lost, 1 - 1e-9)
+
+
+def diffused_on_sphere(albedo: float, angle: np.ndarray) -> np.ndarray:
+    """Solve for the same sources by a series in Legendre polynomials."""
+    z_e, lost, early, unit_kappa = constants(albedo)
 
     def leaving(way, cosine):
         """Light of one beam that leaves at its entry, and there or at its exit."""
@@ -181,8 +191,7 @@ def diffused_on_sphere(albedo: float, angle: np.ndarray) -> np.ndarray:
     source = SIGMA_T * albedo * np.exp(-SIGMA_T * way)
     source = source * (1 - leaving(way, entry / RADIUS)[1])
     source = source * (1 - lost**2 * (0.53 + 0.265 * lost**2))
-    # Case's discrete eigenvalue.
-    kappa = SIGMA_T * brentq(lambda k: albedo * np.arctanh(k) - k, lost, 1 - 1e-9)
+    kappa = SIGMA_T * unit_kappa
     exitance = np.zeros_like(angle)
     for degree in range(60):
         moment = (source * eval_legendre(degree, mu) * of_mu).sum(1) * (2 * degree + 1) / 2
@@ -201,14 +210,53 @@ def diffused_on_sphere(albedo: float, angle: np.ndarray) -> np.ndarray:
 @pytest.mark.long
 def test_the_solution_on_a_sphere_converges_to_the_series():
     errors = []
-    for count in (500, 2000):
+    for count in (500, 2000, 8000):
         splats = bodies.sphere(count, RADIUS, jitter=0.0)
         exitance = solved(splats, medium(), beams(splats), 1e-6)
         series = np.stack([diffused_on_sphere(a, np.radians(angles(splats))) for a in ALBEDO])
         is_even = np.abs(angles(splats) - 45) < 25  # away from the points' poles and the terminator
         errors.append(np.abs(exitance - series)[:, is_even].max() / series.max())
-    assert errors[1] < OF_SERIES
-    assert errors[1] < errors[0] / 2
+    assert errors[2] < OF_CLOSED_FORM
+    assert errors[2] < errors[1] / 2 < errors[0] / 4
+
+
+def diffused_in_slab(depth: float, albedo: float) -> np.ndarray:
+    """Solve for the same sources between two planes, a mean free path of 1 mm: reflectance and
+    transmittance.
+    """
+    z_e, lost, early, kappa = constants(albedo)
+    diffusion = (1 - albedo) / kappa**2
+
+    def equation(z, state):
+        source = albedo * np.exp(-z) * (1 - early(z) - early(depth - z))
+        source = source * (1 - lost**2 * (0.53 + 0.265 * lost**2))
+        return np.stack([state[1], kappa**2 * state[0] - source / diffusion])
+
+    def surfaces(near, far):
+        return np.stack([near[0] - z_e * near[1], far[0] + z_e * far[1]])
+
+    z = np.linspace(0, depth, 400)
+    fluence = solve_bvp(equation, surfaces, z, np.ones((2, 400)), tol=1e-8, max_nodes=100_000).y[0]
+    at_once = [
+        quad(lambda z, begin=begin: early(abs(z - begin)) * albedo * np.exp(-z), 0, depth)[0]
+        for begin in (0, depth)
+    ]
+    return diffusion / z_e * fluence[[0, -1]] + at_once
+
+
+@pytest.mark.long
+def test_the_solution_between_planes_is_the_closed_form():
+    albedo = np.asarray([0.98, 0.9])
+    expected = np.stack([diffused_in_slab(4.0, a) for a in albedo], axis=1)
+    box = trimesh.creation.box([24, 24, 4])
+    vertices, faces = box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3)
+    mesh = sj.geometry.Mesh(vertices, faces, np.repeat(box.face_normals, 3, axis=0))
+    splats = sj.geometry.sample_mesh(mesh, 5000)
+    exitance = solved(splats, sj.Medium(1 - albedo, albedo, 1), beams(splats), 1e-6)
+    is_inner = np.all(np.abs(splats.centers[:, :2]) < 1.5, axis=1)
+    sides = (is_inner & (side * splats.normals[:, 2] > 0.5) for side in (1, -1))
+    found = [exitance[:, side].mean(axis=1) for side in sides]
+    np.testing.assert_allclose(found, expected, atol=OF_CLOSED_FORM)
 
 
 @pytest.mark.once
