@@ -52,7 +52,8 @@ def solved(
     splats: sj.Splats, medium: sj.Medium, beams: Beams, error: float = 1e-4, opening=0.0, even=0.0
 ) -> np.ndarray:
     diffuser = ShapeDiffuser(error, opening)
-    hierarchy, even = diffuser.find_hierarchy(splats), jnp.full((2, splats.count), even)
+    hierarchy = diffuser.find_hierarchy(splats)
+    even = jnp.broadcast_to(jnp.asarray(even, float), (2, splats.count))
     return np.asarray(exitance_of(diffuser, splats, medium, beams, hierarchy, even))
 
 
@@ -117,6 +118,21 @@ def test_a_sphere_that_absorbs_nothing_loses_what_it_does_not_scatter(sphere):
     # Light that crosses 2 R mu unscattered: 2 int exp(-2 R sigma_t mu) mu dmu.
     across = 2 * RADIUS * SIGMA_T
     np.testing.assert_allclose(total, 1 - 2 / across**2, rtol=5e-3)
+
+
+@pytest.mark.once
+def test_even_light_takes_the_way_back_as_well():
+    """Reciprocity: as much light of one place leaves at another as the other way around."""
+    body = bodies.bumpy(SPLATS, RADIUS)
+    dark = dataclasses.replace(beams(body), irradiance=jnp.zeros((2, SPLATS)))
+    for pair in ((0, 40), (100, 300), (250, 550)):
+        squared = np.sum(np.square(body.centers[None] - body.centers[np.asarray(pair), None]), -1)
+        places = np.exp(-squared / 8)
+        there, back = (
+            solved(body, medium(), dark, 1e-5, even=place) @ (body.areas * other)
+            for place, other in (places, places[::-1])
+        )
+        np.testing.assert_allclose(there, back, rtol=0.02)
 
 
 @pytest.mark.long
