@@ -19,10 +19,10 @@ import platform
 import re
 import tempfile
 import threading
-from collections.abc import Callable, Generator, Hashable
+from collections.abc import Callable, Generator, Hashable, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from types import NoneType
+from types import MappingProxyType, NoneType
 from typing import Any, cast
 
 import equinox as eqx
@@ -50,6 +50,7 @@ _SETTINGS = {
     "jax_logging_level": "CRITICAL",
 }
 _folder: Path | None = None
+_compiler_options: dict[str, bool | str] = {}
 _programs: dict[Path, Callable] = {}
 _capacities: dict[Hashable, list[int]] = {}
 
@@ -70,7 +71,10 @@ def watched_compiling(report: Callable[[], object]) -> Generator[None]:
         jax.monitoring.unregister_event_listener(listen)
 
 
-def keep(folder: str | os.PathLike[str] | None = None) -> Path:
+def keep(
+    folder: str | os.PathLike[str] | None = None,
+    compiler_options: Mapping[str, bool | str] = MappingProxyType({}),
+) -> Path:
     r"""Enable the cache: store expensive results, and read them at the next start.
 
     `splatjax.bust`, `splatjax.make_plan`, `splatjax.render` and the other functions of pictures and
@@ -87,13 +91,16 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     - `folder`: created if missing. By default the folder of the command line: `splatjax/jax` in the
       absolute path `XDG_CACHE_HOME`, or in `~/.cache`. It may be deleted at any time; besides JAX's
       own files it takes 1 GB at most.
+    - `compiler_options`: options of XLA for the programs of pictures, such as
+      `{"xla_cpu_use_fusion_emitters": False}`, which compile a third faster and run a tenth slower.
+      If XLA lacks one of them, it gets none.
 
     **Returns:** the subfolder for this kind of processor.
 
     **Raises:** `OSError` when the folder cannot be made; `PermissionError` when `kept` in it
     belongs to another user, or others may write to it; then only JAX's cache is used.
     """
-    global _folder
+    global _folder, _compiler_options
     for name, value in _SETTINGS.items():
         if name.upper() not in os.environ:
             jax.config.update(name, value)
@@ -107,7 +114,7 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     if not _is_private(kept_folder):  # or the system does not show whose it is
         raise PermissionError(f"{kept_folder}: other users may write to this folder; delete it")
     _source()  # now, since files may change while the program runs
-    _folder = kept_folder
+    _folder, _compiler_options = kept_folder, dict(compiler_options)
     return cache_folder
 
 
@@ -188,7 +195,13 @@ def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
         # JAX's cache is off here: an executable read from it and serialized again lacks kernels.
         stack.callback(jax.config.update, _LEAST_TIME, jax.config.values[_LEAST_TIME])
         jax.config.update(_LEAST_TIME, float("inf"))
-        program = jax.jit(of_leaves).lower(leaves).compile()
+        lowered = jax.jit(of_leaves).lower(leaves)
+        try:
+            program = lowered.compile(_compiler_options)
+        except jax.errors.JaxRuntimeError as error:
+            if "No such compile option" not in str(error):
+                raise
+            program = lowered.compile()
     with suppress(Exception):  # not every program can be serialized
         content, _, returned = serialize(program)
         returned = jax.tree.unflatten(returned, range(returned.num_leaves))
@@ -222,7 +235,8 @@ def _path(function: Any, arguments: Any, *, by_values: bool) -> Path | None:
         [(array.aval, values.get(id(array))) for array in arrays],
         [(device, device.device_kind, device.client.platform_version) for device in devices],
         sorted(item for item in jax.config.values.items() if not _EFFECTLESS.search(item[0])),
-        (os.environ.get("XLA_FLAGS"), platform.python_version(), _processor(), _source()),
+        (os.environ.get("XLA_FLAGS"), by_values or sorted(_compiler_options.items())),
+        (platform.python_version(), _processor(), _source()),
         [module.__version__ for module in (jax, jaxlib, eqx)],
     )
     return _folder / f"{function.__name__}-{_digest(repr(depends_on).encode()).hex()}".strip("_")

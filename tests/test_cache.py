@@ -122,6 +122,19 @@ def test_what_another_program_made_is_not_used(change):
     assert made == 2 * ["squares", "total"]
 
 
+def test_programs_are_kept_for_each_set_of_options_of_the_compiler(tmp_path, monkeypatch):
+    monkeypatch.setattr(sj.cache, "_compiler_options", {})
+    expected = results_of_a_start()
+    for options in ({"xla_cpu_use_fusion_emitters": False}, {"xla_no_such_option": True}):
+        sj.cache.keep(tmp_path, compiler_options=options)
+        made.clear()
+        assert results_of_a_start() == results_of_a_start() == expected
+        assert made == ["total"]
+    sj.cache.keep(tmp_path, compiler_options={"xla_cpu_use_fusion_emitters": "neither"})
+    with pytest.raises(jax.errors.JaxRuntimeError):
+        results_of_a_start()
+
+
 class OfTheUser(eqx.Module):
     """Code that may change without splatjax."""
 
