@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+from xdist.scheduler import LoadFileScheduling
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -156,6 +157,7 @@ def pytest_collection_modifyitems(config, items):
             item.add_marker("unoptimized")
     # The longest files first, so that no worker is left alone with one in the end.
     longest = (
+        "tests/studio",
         "tests/inverse",
         "gradients/test_every_float",
         "tests/gradients",
@@ -176,6 +178,18 @@ def pytest_collection_modifyitems(config, items):
     if left_out:
         items[:] = [item for item in items if item not in left_out]
         config.hook.pytest_deselected(items=left_out)
+
+
+class _ByProgram(LoadFileScheduling):
+    """Give a worker whole files, and all files of the studio, which compile the same programs."""
+
+    def _split_scope(self, nodeid):
+        return "studio" if "tests/studio/" in nodeid else super()._split_scope(nodeid)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    return _ByProgram(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 def pytest_collection_finish():

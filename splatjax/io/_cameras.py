@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from splatjax.scene import Camera
 
-from ._files import StrPath, check_units, existing_file, require, with_y_up
+from ._files import StrPath, check_units, existing_file, expect, with_y_up
 from ._trimesh import one_sentence
 
 _Pose: TypeAlias = Float[np.ndarray, "4 4"]
@@ -61,7 +61,7 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
     check_units(path, mm_per_unit, up)
     kind = "folder" if path.is_dir() else existing_file(path).suffix.lower()
     readers = {"folder": _colmap, ".json": _transforms, ".gltf": _gltf, ".glb": _gltf}
-    require(
+    expect(
         kind in readers,
         path,
         "is not a file of cameras; give transforms.json, glTF, or a folder of COLMAP",
@@ -70,7 +70,7 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
         for name, lens, pose in readers[kind](path):
             name = f"{name} {len(cameras)}" if name in cameras else name
             cameras[name] = _camera(f"{path}: {name}", lens, pose, mm_per_unit, up)
-    require(cameras, path, "has no perspective camera; export it with its cameras")
+    expect(cameras, path, "has no perspective camera; export it with its cameras")
     return cameras
 
 
@@ -78,7 +78,7 @@ def load_camera(path: StrPath, name: str = "0", *, mm_per_unit: float, up: str =
     """Read one of the cameras of a file (`load_cameras`), by its name or its number from 0."""
     cameras = load_cameras(path, mm_per_unit=mm_per_unit, up=up)
     names = {str(number): key for number, key in enumerate(cameras)} | {n: n for n in cameras}
-    require(
+    expect(
         name in names,
         path,
         f"has no camera {name!r}; give one of its {len(cameras)} names "
@@ -101,26 +101,26 @@ def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -
     """
     model = lens.get("camera_model", "PINHOLE")
     bent = [f"{name} = {lens[name]}" for name in _DISTORTION if lens.get(name)]
-    require(
+    expect(
         model in _MODELS and not bent,
         where,
         f"its lens is {', '.join([model, *bent])}, {_DISTORTED}",
     )
-    require(
+    expect(
         lens.keys() >= {"w", "h", "fl_x"},
         where,
         f"has only {', '.join(lens)}; add w, h and fl_x, in pixels",
     )
     width, height, focal_x = int(lens["w"]), int(lens["h"]), lens["fl_x"]
     focal_y = lens.get("fl_y", focal_x)
-    require(
+    expect(
         abs(focal_x / focal_y - 1) * width < 2 * _SQUARE,
         where,
         f"fl_x is {focal_x:g} and fl_y is {focal_y:g}, of pixels that are not square; "
         "reconstruct with one focal length, such as SIMPLE_PINHOLE",
     )
     left, scales, right = np.linalg.svd(pose[:3, :3])
-    require(
+    expect(
         scales[0] < (1 + _SHEAR) * scales[2] and np.linalg.det(left @ right) > 0,
         where,
         f"its axes {pose[:3, :3].tolist()} are sheared or mirrored; give a rotation",
@@ -175,7 +175,7 @@ def _colmap_binary(path: Path) -> _Rows:
     data, at = existing_file(path / "cameras.bin").read_bytes(), 8
     for _ in range(*struct.unpack_from("<Q", data)):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
-        require(
+        expect(
             0 <= model < len(models),
             path / "cameras.bin",
             f"its lens is COLMAP's model {model}, {_DISTORTED}",

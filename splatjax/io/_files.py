@@ -21,7 +21,7 @@ from splatjax.scene import Material
 StrPath: TypeAlias = str | os.PathLike[str]
 
 
-def require(holds: Any, where: StrPath, fault: str) -> None:
+def expect(holds: Any, where: StrPath, fault: str) -> None:
     """Raise `ValueError` with a file, or a place in it, and its fault, unless a condition holds."""
     if not holds:
         raise ValueError(f"{where}: {fault}")
@@ -43,7 +43,7 @@ def existing_file(path: StrPath) -> Path:
 def check_suffix(path: StrPath, *suffixes: str) -> None:
     """Raise `ValueError` if the name of an output file has another suffix."""
     is_known = Path(path).suffix.lower() in suffixes
-    require(is_known, path, f"the name of this file must end in {' or '.join(suffixes)}")
+    expect(is_known, path, f"the name of this file must end in {' or '.join(suffixes)}")
 
 
 @contextmanager
@@ -57,12 +57,12 @@ def naming(where: StrPath) -> Generator[None, None, None]:
 
 def check_units(path: StrPath, mm_per_unit: float, up: str = "y") -> None:
     """Raise `ValueError` for an invalid length of the unit (mm) or an invalid upward axis."""
-    require(
+    expect(
         0 < mm_per_unit < np.inf,
         path,
         f"mm_per_unit is {mm_per_unit}; give the positive length of the file's unit in mm",
     )
-    require(up in ("y", "z"), path, f'up is {up!r}; it must be "y" or "z", the file\'s upward axis')
+    expect(up in ("y", "z"), path, f'up is {up!r}; it must be "y" or "z", the file\'s upward axis')
 
 
 def with_y_up(vectors: Float[np.ndarray, "n 3"], up: str) -> Float[np.ndarray, "n 3"]:
@@ -138,7 +138,7 @@ def read_record(path: StrPath) -> dict[str, Any]:
         raise ValueError(
             f"{path}: is not a JSON file ({error}); delete it, or give another folder"
         ) from None
-    require(isinstance(record, dict), path, "is not a record; delete it, or give another folder")
+    expect(isinstance(record, dict), path, "is not a record; delete it, or give another folder")
     return record
 
 
@@ -162,7 +162,7 @@ def save_exports(material: Material, path: StrPath) -> None:
     **Raises:** `ValueError` for a material with separate single scattering, for which other
     renderers have no parameter; `OSError` if the file cannot be written.
     """
-    require(
+    expect(
         material.single_scattering is None,
         path,
         "the material has single scattering besides its Gaussians; fit it without, then export",

@@ -10,7 +10,7 @@ from splatjax._display import srgb_to_linear
 from splatjax._records import check_installed
 from splatjax.geometry import estimate_normals
 
-from ._files import require
+from ._files import expect
 
 _PLACES, _COLORS = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
@@ -52,7 +52,7 @@ def surface_columns(
             for names in (_PLACES, _COLORS, _SCALES, _TURNS)
         )
         scales = np.exp(scales)
-    require(is_kept.any(), path, f"no Gaussian has an opacity of {opacity:g}; give a lower opacity")
+    expect(is_kept.any(), path, f"no Gaussian has an opacity of {opacity:g}; give a lower opacity")
     axes = Rotation.from_quat(turns).as_matrix()
     normals = axes[np.arange(len(axes)), :, scales.argmin(axis=1)]
     is_inward = np.sum(normals * estimate_normals(centers), axis=1) < 0

@@ -19,7 +19,7 @@ from splatjax._records import Numbers
 from splatjax.scene import Camera, Frame
 
 from ._cameras import camera_matrices
-from ._files import StrPath, atomic_path, check_suffix, existing_file, naming, require
+from ._files import StrPath, atomic_path, check_suffix, existing_file, expect, naming
 from ._spectra import SPECTRAL, channel_names, picture_to_rgb
 
 MANIFEST = "splatjax.manifest"  # attribute of the settings of a picture
@@ -73,7 +73,7 @@ def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
     and B nor Y, or has integers, which are encoded for a display.
     """
     values, is_linear = _colors(path)
-    require(is_linear, path, "is encoded for a display; give linear light, such as OpenEXR")
+    expect(is_linear, path, "is encoded for a display; give linear light, such as OpenEXR")
     return values
 
 
@@ -89,7 +89,7 @@ def read_color(path: StrPath) -> Float[np.ndarray, "height width 3"]:
     **Raises:** as `read_picture` does, and `ValueError` for values outside [0, 1].
     """
     values, is_linear = _colors(path)
-    require(
+    expect(
         ((values >= 0) & (values <= 1)).all(),
         path,
         "has an albedo outside [0, 1]; scale it, and remove NaN",
@@ -100,7 +100,7 @@ def read_color(path: StrPath) -> Float[np.ndarray, "height width 3"]:
 def _colors(path: StrPath) -> tuple[Float[np.ndarray, "height width _"], bool]:
     planes, _, is_linear = read_planes(path)
     names = "RGB" if "R" in planes else "Y"
-    require(planes.keys() >= {*names}, path, f"has neither R, G and B nor Y: {', '.join(planes)}")
+    expect(planes.keys() >= {*names}, path, f"has neither R, G and B nor Y: {', '.join(planes)}")
     with np.errstate(invalid="ignore"):  # of NaN that signals
         return np.stack([planes[name] for name in names], axis=-1).astype(np.float64), is_linear
 
@@ -152,7 +152,7 @@ def write_animation(
     **Raises:** `ValueError` for no frames, several sizes, and a speed out of range; `OSError` when
     a frame cannot be read, or the folder does not exist.
     """
-    require(
+    expect(
         frames and 0.1 <= frames_per_second <= 60,
         path,
         f"{len(frames)} frames at {frames_per_second:g} per second; give at least one frame, and "
@@ -176,7 +176,7 @@ class _Film(Image.Image):
     def seek(self, frame: int) -> None:
         with Image.open(self._frames[frame]) as image:
             image.load()
-            require(
+            expect(
                 self.size in ((0, 0), image.size),
                 self._frames[frame],
                 f"is {image.size} pixels, and the first is {self.size}; give all the same size",

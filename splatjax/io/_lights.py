@@ -201,7 +201,7 @@ def look_at(table: Table, width: int, height: int) -> Camera:
     """Make a camera from a table of position, target, up and field of view."""
     vectors = [table.numbers(n, d).tolist() for n, d in zip(PLACE, _UPRIGHT, strict=False)]
     for name, vector in zip(PLACE, vectors, strict=False):
-        table.require(np.shape(vector) == (3,), f"{name} must be three numbers; it is {vector}")
+        table.expect(np.shape(vector) == (3,), f"{name} must be three numbers; it is {vector}")
     *points, up = vectors
     return table.make(
         Camera.look_at, *points, up=up, fov=table.number("fov", 25.0), width=width, height=height
@@ -250,7 +250,7 @@ def light_of(table: Table, channels: int, in_gray: bool = False) -> AbstractLigh
             given["directions"] = even_directions(int(table.number("directions")))
     strength = table.numbers(light.strength_field, 1.0)
     table.make(check_values, light.strength_field, strength, "at least 0", lambda x: x >= 0)
-    table.require(
+    table.expect(
         strength.size in (1, channels),
         f"{light.strength_field} is {strength.tolist()}, for a picture of {channels} channels; "
         "give one number, or one for each channel",

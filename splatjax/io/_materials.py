@@ -26,7 +26,7 @@ from splatjax.scattering import (
 )
 from splatjax.scene import Material
 
-from ._files import StrPath, naming, plain_record, record_names, require
+from ._files import StrPath, expect, naming, plain_record, record_names
 from ._media import (
     BURLEY_ENTRIES,
     KINDS,
@@ -72,7 +72,7 @@ def material_path(name_or_path: StrPath) -> Path:
     path = Path(name_or_path)
     if not isinstance(name_or_path, str) or path.suffix or len(path.parts) != 1:
         return path
-    require(
+    expect(
         name_or_path in list_materials(),
         name_or_path,
         f"is not a known material; {nearest(name_or_path, list_materials())} (a file is named by "
@@ -97,7 +97,7 @@ def load_material(name_or_path: StrPath | Table) -> Material:
     tables, surface, profile = _read(name_or_path)
     path, fitted = tables.path, tables.path.with_name(f"{tables.path.stem}_fitted.toml")
     remedy = f"fit its coefficients by `splatjax fit {path} --output {fitted}`"
-    require("fit" in tables.entries, path, f"has no [fit]; {remedy}")
+    expect("fit" in tables.entries, path, f"has no [fit]; {remedy}")
     fit = tables.table("fit", tables.entries["fit"])
     fit.one_of("unit", [VARIANCE_UNIT])
     digest = digest_of(tables.entries)
@@ -269,13 +269,13 @@ def plain_material(
 
 def _tables(name_or_path: StrPath) -> Table:
     path = material_path(name_or_path)
-    require(
+    expect(
         path.suffix.lower() != ".mtlx",
         path,
         "is MaterialX, which is only written; copy its numbers to [openpbr] in a TOML file",
     )
     entries = read_toml(path, "check the path, or give a material (`splatjax materials`)")
-    require(
+    expect(
         not entries.keys() & {"splats", "camera", "material"},
         path,
         "is the file of a scene; give that of a material",
@@ -290,9 +290,9 @@ def _read(
     tables = material if isinstance(material, Table) else _tables(material)
     path, entries, profile = tables.path, tables.entries, None
     kinds = [KINDS[kind] for kind in KINDS if kind in entries]
-    require(len(kinds) < 2, path, f"has {' and '.join(kinds)}; give one of them")
+    expect(len(kinds) < 2, path, f"has {' and '.join(kinds)}; give one of them")
     missing = f"has no {', '.join(KINDS.values())} or [fit]; give one"
-    require(kinds or "fit" in entries, path, missing)
+    expect(kinds or "fit" in entries, path, missing)
     entries.setdefault("surface", {})
     table = tables.table("surface", _SURFACE)
     if "openpbr" in entries:
@@ -316,7 +316,7 @@ def _read(
     if "wavelengths" in entries:
         surface["wavelengths"] = nodes = tables.numbers("wavelengths")
         own = profile.wavelengths if isinstance(profile, Skin) else nodes
-        require(np.array_equal(own, nodes), path, f"has other wavelengths than its [skin]: {own}")
+        expect(np.array_equal(own, nodes), path, f"has other wavelengths than its [skin]: {own}")
         channels = profile.medium.channels if isinstance(profile, Dipole) else nodes.size
         tables.make(Material, SumOfGaussians([1.0], [[1.0] * channels]), wavelengths=nodes)
     return tables, surface, profile

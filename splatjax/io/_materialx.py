@@ -9,7 +9,7 @@ import numpy as np
 from splatjax.exports import openpbr_subsurface, plain_numbers
 from splatjax.scene import Material
 
-from ._files import StrPath, atomic_path, check_units, require
+from ._files import StrPath, atomic_path, check_units, expect
 
 _DOCUMENT = Template("""<?xml version='1.0' encoding='utf-8'?>
 <materialx version="1.39" colorspace="lin_rec709">
@@ -57,7 +57,7 @@ def check_colors(path: StrPath, material: Material) -> None:
     """Raise `ValueError` for a material that is neither gray nor red, green and blue."""
     is_rgb = material.channels in (1, 3) and material.wavelengths is None
     kind = "channels" if material.wavelengths is None else "wavelengths"
-    require(is_rgb, path, f"the material has {material.channels} {kind}; give gray or RGB")
+    expect(is_rgb, path, f"the material has {material.channels} {kind}; give gray or RGB")
 
 
 def openpbr_inputs(

@@ -67,7 +67,7 @@ def medium_of(table: Table) -> Medium:
     color and a mean free path.
     """
     names = (table.entries.keys() & set().union(*_WAYS)) - {"g"}
-    table.require(
+    table.expect(
         names in [way - {"g"} for way in _WAYS] and ("sigma_s" in names) <= ("g" in table.entries),
         f"has {', '.join(sorted(names)) or 'no coefficients'}; give sigma_a and sigma_s_prime, or "
         "sigma_a, sigma_s and g, or color and mean_free_path",
@@ -90,7 +90,7 @@ def plain_openpbr(table: Table) -> tuple[dict[str, Any], dict[str, float]]:
     """Translate the table of an OpenPBR material to a [medium] and the given part of a
     [surface].
     """
-    table.require(
+    table.expect(
         table.number("subsurface_weight", 1.0) == 1,
         "subsurface_weight must be 1; mixtures with an opaque surface are not supported",
     )
@@ -110,7 +110,7 @@ def burley_of(table: Table) -> Burley:
     """Make normalized diffusion from a table of its albedo and one of its lengths."""
     names = [name for name in _BURLEY if name in table.entries]
     fault = f"has {' and '.join(names) or 'no length'}; give one of {', '.join(_BURLEY)}"
-    table.require(len(names) == 1, fault)
+    table.expect(len(names) == 1, fault)
     length = _MM[table.one_of("unit", _MM)] * table.numbers(names[0])
     return table.make(Burley, table.numbers("albedo"), length, _BURLEY[names[0]])
 
@@ -127,7 +127,7 @@ def layer_of(table: Table) -> Layer | Film:
     """Make the layer or film of a table."""
     if "optical_depth" in table.entries:
         return table.record(Film)
-    table.require(
+    table.expect(
         not {"g", "sigma_s_prime"} <= table.entries.keys(),
         "has g and sigma_s_prime, and layers have reduced scattering alone; leave g out, or give "
         "sigma_s and g",

@@ -25,7 +25,7 @@ from splatjax.geometry import (
 )
 from splatjax.scene import Splats
 
-from ._files import StrPath, check_units, existing_file, naming, require, with_y_up
+from ._files import StrPath, check_units, existing_file, expect, naming, with_y_up
 from ._images import read_color, read_map
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
@@ -138,7 +138,7 @@ def read_textured_mesh(
     """
     path = existing_file(path)
     check_units(path, mm_per_unit, up)
-    require(
+    expect(
         0 <= crease_angle <= 180,
         path,
         f"crease_angle is {crease_angle}; give degrees from 0 to 180",
@@ -156,7 +156,7 @@ def read_textured_mesh(
         },
         weights=weights,
     )
-    require(
+    expect(
         (parameters is None) == (weights is None),
         path,
         f"parameters are {', '.join(parameters or ['None'])}, weights {weights}; give both, or "
@@ -164,7 +164,7 @@ def read_textured_mesh(
     )
     has_maps = any(name is not None for name in (albedo, specular, normal))
     has_maps = has_maps or any(np.ndim(given) for given in textures.parameters.values())
-    require(
+    expect(
         not has_maps or (mesh.uvs is not None and not np.isnan(mesh.uvs).any()),
         path,
         "has no texture coordinates, which maps need; give a mesh with UVs (in glTF, with a "
@@ -174,7 +174,7 @@ def read_textured_mesh(
         mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, mesh.uvs)
     if crop_min_y is not None:
         top = mesh.vertices[:, 1].max() / mm_per_unit
-        require(
+        expect(
             crop_min_y < top,
             path,
             f"crop_min_y is {crop_min_y:g}, which removes the whole mesh; the mesh ends at "
@@ -191,7 +191,7 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
     finite or faces of missing vertices; or does not fit into memory.
     """
     kind = path.suffix[1:].lower()
-    require(kind in FORMATS, path, f"is not a known mesh format; give {', '.join(FORMATS)}")
+    expect(kind in FORMATS, path, f"is not a known mesh format; give {', '.join(FORMATS)}")
     with one_sentence(path):
         content = load_with_trimesh(path, kind)
         pieces = {
@@ -200,7 +200,7 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
             if np.size(table.get("faces", ()))
         }
         read = sum(len(piece.mesh.faces) for piece in pieces.values())
-        require(
+        expect(
             content["triangles"] in (None, read),
             path,
             f"{content['triangles']} triangles were expected, and {read} were read; re-export it",
@@ -212,7 +212,7 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
             world[node.get("frame_to")] = matrix
             if node.get("geometry") in pieces:
                 placed.append((pieces[node["geometry"]], matrix))
-        require(
+        expect(
             placed, path, "has no triangle; give a triangle mesh, or read points with read_splats"
         )
         corners = sum(3 * len(piece.mesh.faces) + len(piece.mesh.vertices) for piece, _ in placed)

@@ -14,7 +14,7 @@ from splatjax._display import srgb_to_linear
 from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
-from ._files import StrPath, atomic_path, check_units, existing_file, naming, require, with_y_up
+from ._files import StrPath, atomic_path, check_units, existing_file, expect, naming, with_y_up
 from ._gaussian_scenes import GAUSSIAN_COLUMNS, spz_columns, surface_columns
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
@@ -93,7 +93,7 @@ def read_splats(
     path = existing_file(path)
     check_units(path, mm_per_unit, up)
     kind = path.suffix[1:].lower()
-    require(
+    expect(
         kind in ("ply", "spz"),
         path,
         f"is a mesh; {_COVER.format(path)}"
@@ -110,7 +110,7 @@ def read_splats(
     centers = fields.pop("centers")
     _check_places(path, centers, estimated=fields["radii"] is None or fields["areas"] is None)
     is_mesh = fields["radii"] is None and columns.get("face")
-    require(not is_mesh, path, f"is a mesh; {_COVER.format(path)}")
+    expect(not is_mesh, path, f"is a mesh; {_COVER.format(path)}")
     with naming(path):
         return complete_splats(centers, **fields)
 
@@ -129,7 +129,7 @@ def write_splats(path: StrPath, splats: Splats) -> None:
         values = getattr(splats, field)
         if values is not None:
             table = np.asarray(values, "<f4").reshape(splats.count, -1)
-            require(
+            expect(
                 table.shape[1] == len(aliases[0]),
                 path,
                 f"{field} has {table.shape[1]} channels; a PLY file stores {', '.join(aliases[0])}",
@@ -182,14 +182,14 @@ class SplatFile:
     ):
         self.path, self.part, self.mm_per_unit, self.up = existing_file(path), part, mm_per_unit, up
         check_units(self.path, mm_per_unit, up)
-        require(part >= 1, path, f"part is {part}; give at least one splat")
+        expect(part >= 1, path, f"part is {part}; give at least one splat")
         with one_sentence(self.path), open(path, "rb") as file:
             from trimesh.exchange.ply import _parse_header  # only where it is needed
 
             elements, is_text, _ = _parse_header(file)
             name, vertices = next(iter(elements.items()))
             kinds = vertices["properties"]
-            require(
+            expect(
                 not is_text and name == "vertex" and not any("LIST" in k for k in kinds.values()),
                 path,
                 f"its vertices are not the first element, in binary without lists; {_COMPLETE}",
@@ -198,7 +198,7 @@ class SplatFile:
             self._names, self._columns = tuple(kinds), np.dtype(list(kinds.items()))
             self._rows(0, self.count)  # raises where the file is cut short
         for field in ("normals", "radii", "areas"):
-            require(
+            expect(
                 any(kinds.keys() >= set(names) for names in _COLUMNS[field]),
                 path,
                 f"its vertices have no {' '.join(_COLUMNS[field][0])}, which cannot be estimated "
@@ -237,7 +237,7 @@ def _splat_fields(
 
     **Raises:** `ValueError` for values that are not finite, or invalid for splats.
     """
-    require(
+    expect(
         not columns.keys() >= _GAUSSIAN_SPLATTING,
         path,
         "is a Gaussian-splatting scene, and lacks some of f_dc_0 to f_dc_2, scale_0 to scale_2, "
@@ -268,7 +268,7 @@ def _splat_fields(
         shape = factors[-1][0]
         places = [place for place, _ in factors]
         as_many = len(places) == math.prod(shape)
-        require(
+        expect(
             as_many and places == [(k + 1, c + 1) for k, c in np.ndindex(shape)],
             path,
             f"its vertices have {', '.join(name for _, name in factors)}, and not one for each "
@@ -286,12 +286,12 @@ def _check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: b
     low, high = centers.min(axis=0), centers.max(axis=0)
     reach, extent = float(np.abs([low, high]).max()), float((high - low).max())
     resolved = float(jnp.finfo(jnp.result_type(float)).eps) * reach
-    require(
+    expect(
         extent >= 1e3 * _SHORTEST or not estimated,
         path,
         f"the extent of its points is {extent:.3g} mm; give its unit (mm_per_unit), or scale it",
     )
-    require(
+    expect(
         extent == 0 or extent >= 1e4 * resolved,
         path,
         f"its points are {reach:.3g} mm from the origin, where single precision resolves "

@@ -16,7 +16,7 @@ from splatjax.render import RenderSettings
 from splatjax.scene import Camera, EnvironmentLight, Material, Scene, Splats
 
 from ._cameras import load_camera, resized
-from ._files import StrPath, naming, plain_record, record_names, require
+from ._files import StrPath, expect, naming, plain_record, record_names
 from ._images import MANIFEST, read_planes
 from ._lights import LIGHT_ENTRIES, PLACE, light_of, look_at, plain_light, write_image
 from ._materials import MATERIAL_TABLES, load_material, plain_material
@@ -74,7 +74,7 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
     else:
         material = file.make(load_material, source)
         material = material if splats.albedo is None else material.white()
-    require(
+    expect(
         material.wavelengths is None or splats.albedo is None,
         path,
         "has a material of wavelengths, and splats with albedo in red, green and blue; give "
@@ -101,7 +101,7 @@ def scene_table(path: StrPath) -> Table:
         scene = read_manifest(path).get("scene")
     else:
         scene = read_toml(path, "give the file of a scene, or a picture")
-    require(
+    expect(
         not isinstance(scene, dict) or scene.keys() & {*_TABLES},
         path,
         "has no [splats], [camera] or [[lights]]; give the file of a scene, whose `material` may "
@@ -119,7 +119,7 @@ def read_manifest(path: StrPath) -> dict[str, Any]:
     record.
     """
     _, header, _ = read_planes(path)
-    require(
+    expect(
         isinstance(header.get(MANIFEST), str),
         path,
         "has no record of its settings; give a picture that `splatjax render` wrote",
@@ -168,7 +168,7 @@ def save_scene(
     """
     path, lights = Path(path), []
     plain = RenderSettings(bounces=settings.bounces, diffuser=settings.diffuser)
-    require(
+    expect(
         eqx.tree_equal(settings, plain) and settings.diffuser in DIFFUSERS.values(),
         path,
         "stores only bounces and a default ClusterDiffuser, ExitanceDiffuser or ShapeDiffuser; "
@@ -178,7 +178,7 @@ def save_scene(
         image = path.with_name(f"{path.stem}_{number}.exr")
         lights.append(plain_light(light, image.name))
         if isinstance(light, EnvironmentLight):
-            require(
+            expect(
                 scene.material.wavelengths is None or light.image.shape[-1] == 1,
                 path,
                 "cannot store an environment of wavelengths; give a gray image, of one channel",
@@ -233,7 +233,7 @@ def _body(table: Table) -> tuple[Path, dict[str, Any]]:
         for name in _MAPS
         if not isinstance(table.entries.get(name, True), bool)
     }
-    table.require(is_mesh or not maps, f"{', '.join(maps)}: maps are only for a mesh")
+    table.expect(is_mesh or not maps, f"{', '.join(maps)}: maps are only for a mesh")
     return path, {"mm_per_unit": unit, "up": table.entries.get("up", "y"), **maps}
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from splatjax.scattering import Tabulated
 
-from ._files import StrPath, atomic_path, check_units, existing_file, naming, require
+from ._files import StrPath, atomic_path, check_units, existing_file, expect, naming
 
 Made = TypeVar("Made")
 
@@ -47,7 +47,7 @@ class Table:
         self.path, self.name, self.entries = path, name, entries
         self.folder = path.parent  # folder of the files that the table names
         self.where = f"{path}: [{name}]" if name else f"{path}:"
-        self.require(isinstance(entries, dict), f"must be a table; it is {entries!r}")
+        self.expect(isinstance(entries, dict), f"must be a table; it is {entries!r}")
         unknown = sorted(entries.keys() - names)
         if unknown:
             raise ValueError(
@@ -60,7 +60,7 @@ class Table:
     def tables(self, name: str, names: Iterable[str]) -> "list[Table]":
         """Return a list of tables within this one; errors number them from 1."""
         value = self.entries.get(name)
-        self.require(
+        self.expect(
             isinstance(value, list) and value, f"{name} must be one table or more; it is {value!r}"
         )
         return [
@@ -68,7 +68,7 @@ class Table:
             for number, entries in enumerate(value, start=1)
         ]
 
-    def require(self, holds: Any, fault: str) -> None:
+    def expect(self, holds: Any, fault: str) -> None:
         """Raise `ValueError` with the table and its fault unless a condition holds."""
         if not holds:
             raise ValueError(f"{self.where} {fault}")
@@ -77,7 +77,7 @@ class Table:
         """Return an entry that is one of some choices."""
         value = self.entries.get(name, default)
         near = difflib.get_close_matches(str(value).lower(), map(str, choices), n=1)
-        self.require(
+        self.expect(
             (type(value), value) in [(type(choice), choice) for choice in choices],
             f"{name} must be {' or '.join(map(_as_toml, choices))}; it is {_as_toml(value)}"
             f"{f'; did you mean {near[0]!r}?' if near else ''}",
@@ -94,7 +94,7 @@ class Table:
         if kinds and kinds <= {int, float}:
             with suppress(TypeError, ValueError, OverflowError):  # rows of several lengths
                 return jnp.asarray(rounded(value))
-        self.require(value is not None, f"{name} is missing; add it")
+        self.expect(value is not None, f"{name} is missing; add it")
         raise ValueError(
             f"{self.where} {name} must be a number, a list of numbers or rows of equal length; it "
             f"is {_as_toml(value)}"
@@ -102,12 +102,12 @@ class Table:
 
     def number(self, name: str, default: float | None = None) -> float:
         values = self.numbers(name, default)
-        self.require(values.ndim == 0, f"{name} must be one number; it is {values.tolist()}")
+        self.expect(values.ndim == 0, f"{name} must be one number; it is {values.tolist()}")
         return float(values)
 
     def text(self, name: str) -> str:
         value = self.entries.get(name)
-        self.require(isinstance(value, str), f"{name} must be a name in quotes; it is {value!r}")
+        self.expect(isinstance(value, str), f"{name} must be a name in quotes; it is {value!r}")
         return value
 
     def make(self, make: Callable[..., Made], *args: Any, **named: Any) -> Made:
@@ -189,17 +189,17 @@ def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
         (where, names), *rows = rows
         for unit, size in _MM.items():
             is_named = re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", ",".join(names))
-            require(
+            expect(
                 not is_named or np.isclose(size, mm_per_unit, rtol=1e-6, atol=0),
                 where,
                 f"gives the unit {unit}, and mm_per_unit is {mm_per_unit:g}; give mm_per_unit = "
                 f"{size:g} (--mm-per-unit {size:g}), or correct the unit",
             )
-    require(len(rows) >= 2, path, f"has {len(rows)} lines of numbers; give at least two radii")
+    expect(len(rows) >= 2, path, f"has {len(rows)} lines of numbers; give at least two radii")
     table, count = [], len(rows[0][1])
     for where, cells in rows:
         table.append([_number(cell) for cell in cells])
-        require(
+        expect(
             1 < len(cells) == count and np.isfinite(rounded(table[-1])).all(),
             where,
             f"{', '.join(cells)} must be a radius and a value for each of {count - 1} channels",
@@ -225,7 +225,7 @@ def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
     """
     contents = f"media are a CSV of {', '.join(_COLUMNS)}"
     (_, head), *rows = _read_rows(path, contents) or [("", [])]
-    require(
+    expect(
         set(head) >= set(_COLUMNS) and rows,
         path,
         f"has the columns {', '.join(head)}, with {len(rows)} rows; {contents}",
@@ -235,7 +235,7 @@ def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
         entries = dict(zip(head, cells, strict=False))
         medium = np.asarray([_number(entries.get(name, "")) for name in _COLUMNS], float)
         is_valid = np.isfinite(medium).all() and medium[0] >= 0 and (medium[1:] > 0).all()
-        require(
+        expect(
             len(cells) == len(head) and is_valid,
             where,
             f"{', '.join(cells)} must be {', '.join(head)}, positive; sigma_a may be 0",
