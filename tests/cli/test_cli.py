@@ -289,7 +289,7 @@ def test_what_was_compiled_is_taken_from_the_cache_in_silence(tmp_path, monkeypa
     """XLA logs an error for whatever it takes from there."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     jax.config.update("jax_compilation_cache_dir", None)
-    prepare_jax()
+    prepare_jax({})
     assert Path(jax.config.jax_compilation_cache_dir).parent == tmp_path / "splatjax" / "jax"
     compilation_cache.reset_cache()
     for hits in (0, 1):  # a new function, of the same program
