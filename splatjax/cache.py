@@ -92,7 +92,7 @@ def keep(
       absolute path `XDG_CACHE_HOME`, or in `~/.cache`. It may be deleted at any time; besides JAX's
       own files it takes 1 GB at most.
     - `compiler_options`: options of XLA for the programs of pictures, such as
-      `{"xla_cpu_use_fusion_emitters": False}`, which compile a third faster and run a tenth slower.
+      `{"xla_cpu_use_fusion_emitters": False}`, which compile a quarter faster and run a tenth slower.
       If XLA lacks one of them, it gets none.
 
     **Returns:** the subfolder for this kind of processor.

@@ -42,7 +42,7 @@ Lengths are in mm.
 `splatjax COMMAND --help` explains a command. --debug adds the traceback to an error.
 `splatjax --version` prints the version."""
 _DEBUG = "--debug"
-# Of XLA: a single picture compiles in two thirds of the time, and renders a tenth slower.
+# Of XLA: a single picture compiles in three quarters of the time, and renders a tenth slower.
 _OF_ONE_PICTURE = {"xla_cpu_use_fusion_emitters": False}
 # Of glibc, from malloc.h: one arena, nothing mapped separately, nothing returned to the system.
 _MALLOPT = {"M_ARENA_MAX": (-8, 1), "M_MMAP_MAX": (-4, 0), "M_TRIM_THRESHOLD": (-1, 2**31 - 1)}
