@@ -13,6 +13,8 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from xdist.scheduler import LoadFileScheduling
 
+from splatjax import cache
+
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
@@ -85,6 +87,12 @@ def jax_settings():
     for name, value in before.items() - jax.config.values.items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_capacities():
+    """Forget what other files planned, which plans reuse: no test depends on its worker's past."""
+    cache._capacities.clear()
 
 
 @pytest.fixture(scope="module", autouse=True)
