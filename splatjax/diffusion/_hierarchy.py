@@ -16,7 +16,7 @@ from ._neighbors import in_rows
 # Number of splats in the clusters of each level: runs of the compact order, which is halved down to
 # the first level.
 SIZES = 1, *(SOURCES_PER_BLOCK << level for level in range(9))
-_AXES = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # of second moments
+AXES = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # of second moments
 _WIDTH = 128  # sources in a row
 _ROWS = 16  # rows evaluated together
 _NONE = np.iinfo(np.int32).max // 2  # index of an absent block, beyond all blocks
@@ -203,7 +203,7 @@ class Clusters(eqx.Module):
             shares = of_splats / jnp.where(totals > 0, totals, 1.0)[:, None]
             means = jnp.sum(shares[None] * x, axis=-1)
             offsets = x - means[..., None]
-            products = jnp.stack([0.5 * offsets[i] * offsets[j] for i, j in _AXES])
+            products = jnp.stack([0.5 * offsets[i] * offsets[j] for i, j in AXES])
             return cls(totals, means, jnp.sum(shares[None] * products, axis=-1))
 
         levels = map(of_level, SIZES[1:])

@@ -6,68 +6,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from splatjax._smooth import mean_decay
-from splatjax.scattering import ExactFresnel, Medium
+from splatjax.scattering import reflectance
 from splatjax.scene import Material
 
+from ._coefficients import DiffusionCoefficients
 from ._diffuser import Beams
-from ._surface_sums import GRAZING, ScreenedKernel, SurfaceSums, dot, integrate
+from ._screened_kernel import ScreenedKernel, integrate
+from ._surface_sums import GRAZING, SurfaceSums, dot
 
 _DEPTHS = 6  # quadrature nodes along each beam
-_MILNE = 0.710446  # extrapolation distance of the Milne problem, mean free paths, times albedo
-_LEAST_ALBEDO = 0.1  # lower bound of the albedo by which `z_e` is divided
-# Hopf's q(tau) = _MILNE - sum_i a_i exp(-b_i tau), within 0.0024.
+# Hopf's q(tau) = q(inf) - sum_i a_i exp(-b_i tau), within 0.0024.
 _HOPF = (0.08948, 2.11533), (0.04361, 16.63774)
 _COSINES = 8  # quadrature nodes of the mean over the hemisphere
 _BRIGHTEST = 2.0  # largest radiance relative to a surface that radiates evenly
 _LONGEST = 60.0  # largest ray length used, mean free paths
 _ENDLESS = 1e9  # mm: the length of a ray without an end
-
-
-class DiffusionCoefficients(eqx.Module):
-    r"""Coefficients of the diffusion equation and its boundary, one for each channel.
-
-    Far from boundaries and beams the solutions decay as those of light transport do: `kappa` is
-    Case's discrete eigenvalue, `kappa / sigma_t = tanh(kappa / sigma_s)`, within 0.2% for albedos
-    above 0.5, and `D = sigma_a / kappa^2`.
-
-    **Attributes:**
-
-    - `sigma_t`: reduced extinction coefficient, 1/mm.
-    - `albedo`: reduced.
-    - `diffusion_coefficient`: `D`, mm.
-    - `squared_kappa`: 1/mm^2.
-    - `z_e`: extrapolation distance, mm.
-    - `lasting`: the fraction of an isotropic source that diffuses; the rest is absorbed within
-      about a mean free path. Fitted to the transmittance of a slab of eight mean free paths.
-    - `inward`: fluence over the irradiance of uniform light that enters, in equilibrium.
-
-    **Source:** Case and Zweifel 1967, "Linear Transport Theory".
-    """
-
-    sigma_t: Float[Array, "*channels"]
-    albedo: Float[Array, "*channels"]
-    diffusion_coefficient: Float[Array, "*channels"]
-    squared_kappa: Float[Array, "*channels"]
-    z_e: Float[Array, "*channels"]
-    lasting: Float[Array, "*channels"]
-    inward: Float[Array, "*channels"]
-
-    @classmethod
-    def of(cls, medium: Medium | None) -> "DiffusionCoefficients":
-        assert medium is not None
-        fresnel, sigma_t, albedo = ExactFresnel(), medium.sigma_t_prime, medium.albedo_prime
-        loss = medium.sigma_a / sigma_t
-        diffusion = (1 + loss * (0.45 + 0.5 * loss)) / (3 - 1.05 * loss) / sigma_t
-        inward = 4 / (1 - fresnel.first_moment(medium.eta))
-        z_e = _MILNE / 4 * (1 + fresnel.second_moment(medium.eta)) * inward
-        z_e = z_e / (sigma_t * jnp.maximum(albedo, _LEAST_ALBEDO))
-        # A half-space that absorbs returns of even light what Chandrasekhar's H gives.
-        inward = inward * (1 + 4.5 * loss) / (1 + 4.95 * loss)
-        lasting = 1 - loss * (0.53 + 0.265 * loss)
-        return cls(sigma_t, albedo, diffusion, medium.sigma_a / diffusion, z_e, lasting, inward)
 
 
 def scattered_once(
@@ -178,20 +134,6 @@ class SurfaceLight(eqx.Module):
     entering: Float[Array, "channels splats"]
     direction: Float[Array, "3 splats"]
 
-    def at_exits(
-        self, surface: SurfaceSums, way: Float[Array, "3 splats"], starts: Bool[Array, " splats"]
-    ):
-        """Follow rays into the body: return the light at their ends, 0 for a ray without an end;
-        the cosine of the exit; and the length of the ray, mm, finite for its derivative.
-        """
-        parts = jax.tree.leaves(self)
-        rows = jnp.concatenate(parts)
-        length, cosine, rows = surface.first_exits(way, starts, rows)
-        ends = jnp.isfinite(length)
-        rows = jnp.where(ends[None], rows, 0.0)
-        light = SurfaceLight(*jnp.split(rows, np.cumsum([len(part) for part in parts])[:-1]))
-        return light, jnp.where(ends, cosine, 1.0), jnp.where(ends, length, _ENDLESS)
-
 
 class SolvedLight(eqx.Module):
     """The light of a body, which does not depend on the eye.
@@ -232,14 +174,36 @@ class SolvedLight(eqx.Module):
         light = SurfaceLight(
             fluence, flux, beams.irradiance, entering, direction=jnp.mean(directions, axis=0)
         )
-        far, _, thickness = light.at_exits(surface, -normals, surface.areas > 0)
+        far, _, thickness = at_exits(light, surface, -normals, surface.areas > 0)
 
         def towards(cosine):
             mu = _inside(jnp.full_like(thickness, cosine), material.eta)
-            return 2 * cosine * source_integral(light, far, mu, mu, thickness / mu, coefficients)
+            turned = _reflected(mu, material.eta)
+            gathered = source_integral(light, far, mu, mu, thickness / mu, turned, coefficients)
+            return 2 * cosine * gathered
 
         mean = integrate(towards, _COSINES, exitance)
         return cls(exitance, surface.slopes(exitance), light, mean)
+
+
+def at_exits(
+    light: PyTree[Array],
+    surface: SurfaceSums,
+    way: Float[Array, "3 splats"],
+    starts: Bool[Array, " splats"],
+):
+    """Follow rays into the body: return the light at their ends, 0 for a ray without an end; the
+    cosine of the exit; and the length of the ray, mm, finite for its derivative.
+    """
+    leaves, structure = jax.tree.flatten(light)
+    rows = jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in leaves])
+    length, cosine, rows = surface.first_exits(way, starts, rows)
+    ends = jnp.isfinite(length)
+    rows = jnp.where(ends[None], rows, 0.0)
+    parts = jnp.split(rows, np.cumsum([leaf.size // leaf.shape[-1] for leaf in leaves])[:-1])
+    shaped = [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)]
+    light = jax.tree.unflatten(structure, shaped)
+    return light, jnp.where(ends, cosine, 1.0), jnp.where(ends, length, _ENDLESS)
 
 
 def radiance_towards(
@@ -252,10 +216,11 @@ def radiance_towards(
     r"""Compute `pi` times the radiance of `seen` splats towards an eye, without the Fresnel loss:
     the source integral along the refracted ray `w` up to its exit from the body, over its mean,
 
-        L = f M / pi - sigma_s' / (4 pi sigma_t'^2) w . grad phi
+        L = f M / pi + sigma_s' / (4 pi sigma_t'^2) [w . grad phi]
 
-    Along the surface `phi` is linear: seen from the lit side a splat is darker than M, and from the
-    dark side brighter, by half beyond the terminator of a sphere.
+    with the slopes along the surface at the near end, less those at the far end times `(1 - F)
+    exp(-sigma_t' s)`: seen from the lit side a splat is darker than M, and from the dark side
+    brighter, by half beyond the terminator of a sphere.
     """
     coefficients = DiffusionCoefficients.of(material.medium)
     normals, eta = surface.normals, material.eta
@@ -267,16 +232,18 @@ def radiance_towards(
     along = (to_eye - cosine[None] * normals) / eta
     mu = _inside(cosine, eta)
     way = -(along + mu[None] * normals)
-    far, far_mu, length = light.surface.at_exits(surface, way, seen)
-    gathered = source_integral(light.surface, far, mu, far_mu, length, coefficients)
+    near = light.surface, light.slopes
+    (far, far_slopes), far_mu, length = at_exits(near, surface, way, seen)
+    turned = _reflected(far_mu, eta)
+    gathered = source_integral(light.surface, far, mu, far_mu, length, turned, coefficients)
     shape = gathered / jnp.where(light.mean > 0, light.mean, 1.0)
     shape = jnp.where(light.mean > 0, jnp.clip(shape, 0, _BRIGHTEST), 1.0)
     optical = jnp.minimum(length[None] * coefficients.sigma_t[:, None], _LONGEST)
-    slope = jnp.sum(light.slopes * along[None], axis=1)
+    slope, far_slope = (jnp.sum(rows * way[None], axis=1) for rows in (light.slopes, far_slopes))
     spread = 4 * coefficients.diffusion_coefficient * coefficients.sigma_t
     depth = (coefficients.albedo * coefficients.z_e / spread)[:, None]
-    sideways = depth * slope * (1 - (1 + optical) * jnp.exp(-optical))
-    return jnp.maximum(light.exitance * shape - sideways, 0)
+    sideways = depth * (slope - (1 - turned)[None] * jnp.exp(-optical) * far_slope)
+    return jnp.maximum(light.exitance * shape + sideways, 0)
 
 
 def source_integral(
@@ -285,6 +252,7 @@ def source_integral(
     mu: Float[Array, " splats"],
     far_mu: Float[Array, " splats"],
     length: Float[Array, " splats"],
+    turned: Float[Array, " splats"],
     medium: DiffusionCoefficients,
 ) -> Float[Array, "channels splats"]:
     r"""Integrate the light scattered towards the near end of a ray, `pi` times the radiance,
@@ -293,20 +261,22 @@ def source_integral(
 
     If the faces at its ends are parallel, `phi` fulfills the diffusion equation in between, and
     integration by parts gives the integral in closed form by its values and slopes at the ends, and
-    `Q`.
+    `Q`. What the far end reflects is light from a thick body behind it.
 
     **Arguments:**
 
     - `near`, `far`: light at the ends.
     - `mu`, `far_mu`: cosines of the ray inside, there.
     - `length`: of the ray, mm.
+    - `turned`: internal reflectance at the far end.
     """
     albedo, z_e = medium.albedo[:, None], (medium.z_e * medium.sigma_t)[:, None]
-    mu, far_mu, length = mu[None], far_mu[None], length[None]
+    mu, far_mu, length, turned = mu[None], far_mu[None], length[None], turned[None]
     s = jnp.minimum(length * medium.sigma_t[:, None], _LONGEST)
     spread = (medium.diffusion_coefficient * medium.sigma_t)[:, None]
     bend = (1 - albedo) / spread * mu * mu  # below 1: a solution decays slower than a beam
-    at_near, at_far = z_e * near.fluence + mu * near.flux, z_e * far.fluence - far_mu * far.flux
+    at_near = z_e * near.fluence + mu * near.flux
+    at_far = (1 - turned) * z_e * far.fluence - (1 + turned) * far_mu * far.flux
     diffused = albedo / spread * (at_near - jnp.exp(-s) * at_far) / (1 - bend)
     # A beam that enters at one end decays towards the other, at these rates along the ray.
     entering, far_entering = (jnp.maximum(x.entering, GRAZING) for x in (near, far))
@@ -327,3 +297,11 @@ def _inside(cosine: Float[Array, " splats"], eta: Float[Array, ""]) -> Float[Arr
     """Compute the cosine of a refracted ray."""
     sine = (1 - cosine * cosine) / (eta * eta)
     return jnp.sqrt(jnp.maximum(1 - sine, GRAZING * GRAZING))
+
+
+def _reflected(inside: Float[Array, " splats"], eta: Float[Array, ""]) -> Float[Array, " splats"]:
+    """Compute the reflectance of the surface for light that arrives at a cosine inside."""
+    squared = 1 - (1 - inside * inside) * (eta * eta)
+    is_partial = squared > GRAZING * GRAZING
+    outside = jnp.sqrt(jnp.where(is_partial, squared, 1.0))
+    return jnp.where(is_partial, reflectance(inside, outside, eta), 1.0)

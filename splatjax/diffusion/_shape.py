@@ -15,6 +15,7 @@ from splatjax._records import record, valid
 from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
 
+from ._coefficients import DiffusionCoefficients
 from ._diffuser import (
     AbstractDiffuser,
     AbstractDiffusionPlan,
@@ -23,8 +24,9 @@ from ._diffuser import (
     LayerValues,
 )
 from ._hierarchy import SIZES, Hierarchy, padded
-from ._rays import DiffusionCoefficients, SolvedLight, radiance_towards, scattered_once
-from ._surface_sums import SOFTENED, ScreenedKernel, SurfaceSums
+from ._rays import SolvedLight, radiance_towards, scattered_once
+from ._screened_kernel import SOFTENED, ScreenedKernel
+from ._surface_sums import SurfaceSums
 
 _SOFTENING = 2**-0.25  # softening length over the spacing
 _FINER = 2**-0.5  # softening length of the sources over the length on the surface

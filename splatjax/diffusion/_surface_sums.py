@@ -1,121 +1,17 @@
-"""Layer potentials on the surface of a body, and paths through it: sums over all its splats, with
-the Green's function of the diffusion equation, softened within their spacing.
-"""
-
-import math
-from collections.abc import Callable
+"""Layer potentials on the surface of a body, and paths through it: sums over all its splats."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
 
-from ._hierarchy import Clusters, Hierarchy, cluster_totals, padded
+from ._hierarchy import AXES, Clusters, Hierarchy, cluster_totals, padded
+from ._screened_kernel import ScreenedKernel
 
 GRAZING = 1e-3  # cosine
 _OVERLAP = 1.5  # radius of a splat over the root of its area
-_SMALL = 0.1  # squared distance, in softening lengths, below which a series is used
-_NODES, _REACH = 12, 4.0  # of the integral of the removed part: nodes, and end in softening lengths
-_SCALE = 2 / math.sqrt(math.pi)
-# The series of `erf(sqrt(q)) / sqrt(q)` up to the eighth power of q.
-_SERIES = [_SCALE * (-1) ** n / (math.factorial(n) * (2 * n + 1)) for n in range(8, -1, -1)]
-SOFTENED = 3.0  # softening lengths beyond which the kernel is not softened
-
-
-class ScreenedKernel(eqx.Module):
-    r"""`G = exp(-kappa r) / (4 pi r)`, with the distance softened:
-
-        r_s = r / erf(r / length)
-
-    It is smooth, points of a surface at most `length` apart resolve it, and it is `G` beyond three
-    lengths. The part that softening removes is integrated over a plane through each point.
-
-    **Attributes:** (differentiable)
-
-    - `kappa`: 1/mm.
-    - `length`: mm.
-    """
-
-    kappa: Float[Array, "channels"]
-    length: Float[Array, ""]
-
-    def near(self, squared_distances: Float[Array, "*pairs"]) -> list[tuple]:
-        """Compute the softened kernel of every channel, 1/mm, and `-1/r` times its derivative in
-        `r`, 1/mm^3.
-        """
-        inverse, fall = self._softening(squared_distances)
-        distance, inverse, fall = 1 / inverse, inverse / (4 * math.pi), fall / (4 * math.pi)
-
-        def of_channel(kappa):
-            exponent = kappa * distance
-            screened = jnp.exp(-exponent)
-            return inverse * screened, fall * (1 + exponent) * screened
-
-        return [of_channel(kappa) for kappa in self.kappa]
-
-    def far(self, squared_distances: Float[Array, "*pairs"]) -> list[tuple]:
-        """Compute the kernel beyond three lengths, 1/mm, and apply `-1/r d/dr` once, 1/mm^3, and
-        twice, 1/mm^5. All are finite at distance 0.
-        """
-        inverse = jax.lax.rsqrt(jnp.where(squared_distances > 0, squared_distances, 1.0))
-        distance, squared = squared_distances * inverse, inverse * inverse
-
-        def of_channel(kappa):
-            exponent = kappa * distance
-            value = jnp.exp(-exponent) * inverse / (4 * math.pi)
-            once, twice = 1 + exponent, 3 + exponent * (3 + exponent)
-            return value, value * squared * once, value * squared * squared * twice
-
-        return [of_channel(kappa) for kappa in self.kappa]
-
-    def _softening(self, squared_distances):
-        """Compute `1 / r_s`, and `-1/r` times its derivative in `r`."""
-        q = squared_distances / (self.length * self.length)
-        near = q < _SMALL
-        away = jnp.where(near, 1.0, q)
-        root, small = jnp.sqrt(away), jnp.where(near, q, 0.0)
-        ratio = jax.scipy.special.erf(root) / root
-        fall = (ratio - _SCALE * jnp.exp(-away)) / away
-        series, slope = (jnp.asarray(s, q.dtype) for s in (_SERIES, -2 * np.polyder(_SERIES)))
-        ratio = jnp.where(near, jnp.polyval(series, small), ratio)
-        fall = jnp.where(near, jnp.polyval(slope, small), fall)
-        return ratio / self.length, fall / self.length**3
-
-    def plane_integral(self, height: Float[Array, "channels *points"]) -> Float[Array, "..."]:
-        """Integrate the part that softening removes over a plane, mm.
-
-        **Arguments:**
-
-        - `height`: of the point over the plane, mm.
-        """
-        kappa = self.kappa.reshape(-1, *[1] * (height.ndim - 1))
-        end = _REACH * self.length
-        span = jnp.maximum(end - jnp.abs(height), 0)
-
-        def removed(fraction):
-            r = end - span * (1 - fraction)
-            inverse, _ = self._softening(r * r)
-            return jnp.exp(-kappa * r) - r * inverse * jnp.exp(-kappa / inverse)
-
-        return 0.5 * span * integrate(removed, _NODES, height)
-
-
-def integrate(
-    function: Callable[[Array], Float[Array, "*shape"]], nodes: int, like: Float[Array, "*shape"]
-) -> Float[Array, "*shape"]:
-    """Integrate a function from 0 to 1 by Gauss and Legendre's rule, one node after the other; its
-    values have the shape of `like`.
-    """
-    x, weights = np.polynomial.legendre.leggauss(nodes)
-    rule = jnp.asarray(np.stack([(1 + x) / 2, weights / 2], axis=1), like.dtype)
-
-    def add(total, node_and_weight):
-        return total + node_and_weight[1] * function(node_and_weight[0]), None
-
-    return jax.lax.scan(jax.checkpoint(add), jnp.zeros_like(like), rule)[0]
 
 
 class SurfaceSums(eqx.Module):
@@ -124,6 +20,8 @@ class SurfaceSums(eqx.Module):
     **Attributes:**
 
     - `clusters`: weighted by area.
+    - `bends`: of the clusters, the means of normal times offset from the center, mm: xx, yy, zz,
+      xy, xz, yz, symmetric. Two opposite faces have dipoles that cancel, and this.
     """
 
     hierarchy: Hierarchy
@@ -131,6 +29,7 @@ class SurfaceSums(eqx.Module):
     normals: Float[Array, "3 splats"]
     areas: Float[Array, " splats"]
     clusters: Clusters
+    bends: Float[Array, "6 clusters"]
 
     @classmethod
     def of(cls, splats: Splats, hierarchy: Hierarchy) -> "SurfaceSums":
@@ -140,7 +39,15 @@ class SurfaceSums(eqx.Module):
                 "weights=None, or render with ClusterDiffuser"
             )
         centers, normals, areas = padded((splats.centers.T, splats.normals.T, splats.areas))
-        return cls(hierarchy, centers, normals, areas, Clusters.of(centers, areas))
+        clusters, facing = Clusters.of(centers, areas), areas[None] * normals
+
+        def product(i: int, j: int):
+            about_origin = cluster_totals(facing[i] * centers[j])
+            return about_origin - cluster_totals(facing[i]) * clusters.centers[j]
+
+        bends = jnp.stack([0.5 * (product(i, j) + product(j, i)) for i, j in AXES])
+        bends = bends / jnp.where(clusters.totals > 0, clusters.totals, 1.0)[None]
+        return cls(hierarchy, centers, normals, areas, clusters, bends)
 
     def layers(
         self,
@@ -166,26 +73,31 @@ class SurfaceSums(eqx.Module):
             ]
 
         def far(x, sources):
-            totals, dipoles, y, moments = sources
+            totals, dipoles, turned, y, moments, bends = sources
             offset = _offset(x, y)
             trace, along = _second_moments(moments, offset)
+            bent_trace, bent_along = _second_moments(bends, offset)
             return [
                 jnp.sum(
-                    total * (value + along * twice - trace * once) - dot(offset, dipole) * once,
+                    total * (value + along * twice - trace * once)
+                    + power * (bent_along * twice - bent_trace * once)
+                    - dot(offset, dipole) * once,
                     axis=1,
                 )
-                for total, dipole, (value, once, twice) in zip(
-                    totals, dipoles, kernel.far(dot(offset, offset)), strict=True
+                for total, dipole, power, (value, once, twice) in zip(
+                    totals, dipoles, turned, kernel.far(dot(offset, offset)), strict=True
                 )
             ]
 
         centers, moments = self.clusters.centers, self.clusters.moments
-        totals = charges[:, None] * cluster_totals(powers)
+        sums = cluster_totals(powers)
+        totals = charges[:, None] * sums
         about_origin = powers[:, None] * (
             charges[:, None, None] * self.centers[None] + facing[None]
         )
         dipoles = cluster_totals(about_origin) - totals[:, None] * centers[None]
-        inputs = (powers, facing, self.centers), (totals, dipoles, centers, moments)
+        clusters = totals, dipoles, dipole * sums, centers, moments, self.bends
+        inputs = (powers, facing, self.centers), clusters
         return self.hierarchy.reduce(near, far, self.centers, *inputs)
 
     def potential(
@@ -310,7 +222,7 @@ def _offset(x, y):
 
 
 def _second_moments(moments, offset):
-    """Contract half the second moments with the identity, and with the offset twice."""
+    """Contract second moments with the identity, and with the offset twice."""
     xx, yy, zz, xy, xz, yz = moments
     x, y, z = offset
     along = xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
