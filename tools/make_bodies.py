@@ -201,11 +201,11 @@ PICTURED = "sphere", "sphere_refracting", "sheet4", "head", "head_refracting"
 PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"
 BEGIN, END = "<!-- table: tools/make_bodies.py -->", "<!-- end of table -->"
 TITLES = ("body", "model", "error: red, green, blue", "inside", "FLIP", "seconds")
-TITLES += ("path tracer's seconds to the same error",)
+TITLES += ("paths per pixel to the same error",)
 
 
 class Truth(NamedTuple):
-    """A path-traced picture, the variance that is left of its noise, and its seconds.
+    """A path-traced picture, the variance that is left of its noise, and its paths per pixel.
 
     Pixels count where they are sound: the others are few, each made brighter than all light by one
     stray path in a hundred million. Shown at the exposure, bright parts are 0.8.
@@ -213,7 +213,7 @@ class Truth(NamedTuple):
 
     picture: np.ndarray
     variance: np.ndarray
-    seconds: float
+    paths: int
     sound: np.ndarray
     exposure: float
 
@@ -226,11 +226,10 @@ def read_truth(body: Body, folder: Path) -> Truth:
     with np.load(path) as file:
         passes = int(file["passes"])
         mean, squares = file["total"] / passes, file["squares"] / passes
-        seconds = float(file["seconds"]) * passes
     variance = np.maximum((squares - mean**2) / (passes - 1), 0)
     bright = np.quantile(mean, 0.98, axis=(0, 1))
     sound = np.all(np.sqrt(variance) < 0.25 * bright, axis=-1)
-    return Truth(mean, variance, seconds, sound, 0.8 / float(np.quantile(mean, 0.98)))
+    return Truth(mean, variance, passes * SAMPLES, sound, 0.8 / float(np.quantile(mean, 0.98)))
 
 
 @functools.cache
@@ -314,7 +313,8 @@ def splatted(
 
 def row(what: str, name: str, truth: Truth, picture: np.ndarray, seconds: float) -> str:
     """Return a row of the table: per channel the root mean square error over that of the truth,
-    whose noise is subtracted; the same without 3 pixels along the outline; the FLIP error; times.
+    whose noise is subtracted; the same without 3 pixels along the outline; the FLIP error; the
+    seconds; and the paths per pixel with which the path tracer's noise is as large.
     """
     import flip_evaluator
 
@@ -329,9 +329,9 @@ def row(what: str, name: str, truth: Truth, picture: np.ndarray, seconds: float)
     masked = (truth.exposure * truth.sound[..., None] * image for image in (truth.picture, picture))
     shown = [linear_to_srgb(image).astype(np.float32) for image in masked]
     flip = float(flip_evaluator.evaluate(*shown, "LDR")[1])
-    equal = truth.seconds * (noise / power).mean() / np.mean(np.square(rms))
+    equal = truth.paths * (noise / power).mean() / np.mean(np.square(rms))
     cells = (", ".join(f"{100 * value:.1f}" for value in values) + "%" for values in (rms, inside))
-    return line(what, name, *cells, f"{flip:.3f}", f"{seconds:.2f}", f"{equal:.1f}")
+    return line(what, name, *cells, f"{flip:.3f}", f"{seconds:.2f}", f"{equal:.0f}")
 
 
 def line(*cells: str) -> str:

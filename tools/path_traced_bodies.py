@@ -2,11 +2,10 @@
 tools/path_traced_bodies.py FOLDER [NAME ...]`.
 
 Needs `mitsuba` (the dependency group `truth`). A body whose file FOLDER/NAME.npz is there already
-is kept: remove the file to trace it again. The time in it is that of the fastest pass.
+is kept: remove the file to trace it again.
 """
 
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -93,20 +92,18 @@ def trace(mi, body: Body, path: Path, albedo=ALBEDO) -> None:
     """
     mesh = path.with_suffix(".ply")
     body.shape().export(mesh)
-    described, total, squares, seconds = scene(mi, body, mesh, albedo), 0.0, 0.0, np.inf
+    described, total, squares = scene(mi, body, mesh, albedo), 0.0, 0.0
     black = scene(mi, body, mesh, (0.0, 0.0, 0.0))
     passes = PASSES if body.eta == 1 else 4 * PASSES  # without connections to the lights
     for number in track(range(passes), description=body.name):
-        start = time.perf_counter()
         picture = np.array(mi.render(described, spp=SAMPLES, seed=number), np.float64)
-        seconds = min(seconds, time.perf_counter() - start)
         if body.eta != 1:
             picture -= np.array(mi.render(black, spp=SAMPLES, seed=number), np.float64)
         if not np.isfinite(picture).all():
             raise ValueError(f"{path}: pass {number} has values that are not finite")
         total, squares = total + picture, squares + picture**2
     with atomic_path(path) as temporary:
-        np.savez(temporary, total=total, squares=squares, seconds=seconds, passes=passes)
+        np.savez(temporary, total=total, squares=squares, passes=passes)
 
 
 def main() -> None:

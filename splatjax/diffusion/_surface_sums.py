@@ -73,30 +73,34 @@ class SurfaceSums(eqx.Module):
             ]
 
         def far(x, sources):
-            totals, dipoles, turned, y, moments, bends = sources
+            powers, dipoles, y, moments, bends = sources
             offset = _offset(x, y)
             trace, along = _second_moments(moments, offset)
             bent_trace, bent_along = _second_moments(bends, offset)
             return [
                 jnp.sum(
-                    total * (value + along * twice - trace * once)
-                    + power * (bent_along * twice - bent_trace * once)
-                    - dot(offset, dipole) * once,
+                    power
+                    * (
+                        charge * value
+                        + (charge * along + dipole * bent_along) * twice
+                        - (charge * trace + dipole * bent_trace) * once
+                    )
+                    - dot(offset, directed) * once,
                     axis=1,
                 )
-                for total, dipole, power, (value, once, twice) in zip(
-                    totals, dipoles, turned, kernel.far(dot(offset, offset)), strict=True
+                for charge, power, directed, (value, once, twice) in zip(
+                    charges, powers, dipoles, kernel.far(dot(offset, offset)), strict=True
                 )
             ]
 
         centers, moments = self.clusters.centers, self.clusters.moments
-        sums = cluster_totals(powers)
-        totals = charges[:, None] * sums
+        totals = cluster_totals(powers)
         about_origin = powers[:, None] * (
             charges[:, None, None] * self.centers[None] + facing[None]
         )
-        dipoles = cluster_totals(about_origin) - totals[:, None] * centers[None]
-        clusters = totals, dipoles, dipole * sums, centers, moments, self.bends
+        dipoles = cluster_totals(about_origin)
+        dipoles = dipoles - (charges[:, None] * totals)[:, None] * centers[None]
+        clusters = totals, dipoles, centers, moments, self.bends
         inputs = (powers, facing, self.centers), clusters
         return self.hierarchy.reduce(near, far, self.centers, *inputs)
 
