@@ -304,4 +304,5 @@ def _reflected(inside: Float[Array, " splats"], eta: Float[Array, ""]) -> Float[
     squared = 1 - (1 - inside * inside) * (eta * eta)
     is_partial = squared > GRAZING * GRAZING
     outside = jnp.sqrt(jnp.where(is_partial, squared, 1.0))
-    return jnp.where(is_partial, reflectance(inside, outside, eta), 1.0)
+    ratio = jnp.broadcast_to(eta, inside.shape)
+    return jnp.where(is_partial, reflectance(inside, outside, ratio), 1.0)
