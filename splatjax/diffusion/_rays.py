@@ -178,8 +178,8 @@ class SolvedLight(eqx.Module):
 
         def towards(cosine):
             mu = _inside(jnp.full_like(thickness, cosine), material.eta)
-            turned = _reflected(mu, material.eta)
-            gathered = source_integral(light, far, mu, mu, thickness / mu, turned, coefficients)
+            reflected = _internal_reflectance(mu, material.eta)
+            gathered = source_integral(light, far, mu, mu, thickness / mu, reflected, coefficients)
             return 2 * cosine * gathered
 
         mean = integrate(towards, _COSINES, exitance)
@@ -234,15 +234,15 @@ def radiance_towards(
     way = -(along + mu[None] * normals)
     near = light.surface, light.slopes
     (far, far_slopes), far_mu, length = at_exits(near, surface, way, seen)
-    turned = _reflected(far_mu, eta)
-    gathered = source_integral(light.surface, far, mu, far_mu, length, turned, coefficients)
+    reflected = _internal_reflectance(far_mu, eta)
+    gathered = source_integral(light.surface, far, mu, far_mu, length, reflected, coefficients)
     shape = gathered / jnp.where(light.mean > 0, light.mean, 1.0)
     shape = jnp.where(light.mean > 0, jnp.clip(shape, 0, _BRIGHTEST), 1.0)
     optical = jnp.minimum(length[None] * coefficients.sigma_t[:, None], _LONGEST)
     slope, far_slope = (jnp.sum(rows * way[None], axis=1) for rows in (light.slopes, far_slopes))
     spread = 4 * coefficients.diffusion_coefficient * coefficients.sigma_t
     depth = (coefficients.albedo * coefficients.z_e / spread)[:, None]
-    sideways = depth * (slope - (1 - turned)[None] * jnp.exp(-optical) * far_slope)
+    sideways = depth * (slope - (1 - reflected)[None] * jnp.exp(-optical) * far_slope)
     return jnp.maximum(light.exitance * shape + sideways, 0)
 
 
@@ -252,7 +252,7 @@ def source_integral(
     mu: Float[Array, " splats"],
     far_mu: Float[Array, " splats"],
     length: Float[Array, " splats"],
-    turned: Float[Array, " splats"],
+    reflected: Float[Array, " splats"],
     medium: DiffusionCoefficients,
 ) -> Float[Array, "channels splats"]:
     r"""Integrate the light scattered towards the near end of a ray, `pi` times the radiance,
@@ -268,15 +268,15 @@ def source_integral(
     - `near`, `far`: light at the ends.
     - `mu`, `far_mu`: cosines of the ray inside, there.
     - `length`: of the ray, mm.
-    - `turned`: internal reflectance at the far end.
+    - `reflected`: internal reflectance at the far end.
     """
     albedo, z_e = medium.albedo[:, None], (medium.z_e * medium.sigma_t)[:, None]
-    mu, far_mu, length, turned = mu[None], far_mu[None], length[None], turned[None]
+    mu, far_mu, length, reflected = mu[None], far_mu[None], length[None], reflected[None]
     s = jnp.minimum(length * medium.sigma_t[:, None], _LONGEST)
     spread = (medium.diffusion_coefficient * medium.sigma_t)[:, None]
     bend = (1 - albedo) / spread * mu * mu  # below 1: a solution decays slower than a beam
     at_near = z_e * near.fluence + mu * near.flux
-    at_far = (1 - turned) * z_e * far.fluence - (1 + turned) * far_mu * far.flux
+    at_far = (1 - reflected) * z_e * far.fluence - (1 + reflected) * far_mu * far.flux
     diffused = albedo / spread * (at_near - jnp.exp(-s) * at_far) / (1 - bend)
     # A beam that enters at one end decays towards the other, at these rates along the ray.
     entering, far_entering = (jnp.maximum(x.entering, GRAZING) for x in (near, far))
@@ -299,7 +299,9 @@ def _inside(cosine: Float[Array, " splats"], eta: Float[Array, ""]) -> Float[Arr
     return jnp.sqrt(jnp.maximum(1 - sine, GRAZING * GRAZING))
 
 
-def _reflected(inside: Float[Array, " splats"], eta: Float[Array, ""]) -> Float[Array, " splats"]:
+def _internal_reflectance(
+    inside: Float[Array, " splats"], eta: Float[Array, ""]
+) -> Float[Array, " splats"]:
     """Compute the reflectance of the surface for light that arrives at a cosine inside."""
     squared = 1 - (1 - inside * inside) * (eta * eta)
     is_partial = squared > GRAZING * GRAZING

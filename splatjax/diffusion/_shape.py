@@ -64,8 +64,8 @@ class ShapeDiffuser(AbstractDiffuser):
     - `error`: residual of the linear equations divided by their right side, root mean squares.
       Static.
     - `opening`: largest radius of the clusters of far splats, divided by their distance. The error
-      of exitance is 3e-3 on a sphere and 5e-3 on slabs, of which up to 2% of what they transmit.
-      With 0 nothing is merged, for reference. Static.
+      of exitance is 3e-3 on a sphere and 5e-3 on slabs, which transmit up to 2% too little. With
+      0 nothing is merged, for reference. Static.
 
     **Source:** Case and Zweifel 1967, "Linear Transport Theory" (Milne problem); Zhu, Pine and
     Weitz 1991, "Internal reflection of diffusive light in random media" (`z_e`).

@@ -21,7 +21,7 @@ class SurfaceSums(eqx.Module):
 
     - `clusters`: weighted by area.
     - `bends`: of the clusters, the means of normal times offset from the center, mm: xx, yy, zz,
-      xy, xz, yz, symmetric. Two opposite faces have dipoles that cancel, and this.
+      xy, xz, yz, symmetric. The dipoles of two opposite faces cancel; this moment remains.
     """
 
     hierarchy: Hierarchy

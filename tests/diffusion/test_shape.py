@@ -104,8 +104,8 @@ def test_a_slab_returns_and_lets_through_what_light_transport_does(depth):
     mesh = sj.geometry.Mesh(vertices, faces, np.repeat(box.face_normals, 3, axis=0))
     splats = sj.geometry.sample_mesh(mesh, 4000)
     splats = splats.take(jnp.asarray(compact_order(np.asarray(splats.centers))))
-    medium, opening = sj.Medium([0.02, 0.1], [0.98, 0.9], 1), ShapeDiffuser().opening
-    exitance = solved(splats, medium, beams(splats), opening=opening)
+    of_slab, opening = sj.Medium([0.02, 0.1], [0.98, 0.9], 1), ShapeDiffuser().opening
+    exitance = solved(splats, of_slab, beams(splats), opening=opening)
     is_inner = np.all(np.abs(splats.centers[:, :2]) < 3, axis=1)
     for side, expected in zip((1, -1), SLABS[depth], strict=True):
         mean = exitance[:, is_inner & (side * splats.normals[:, 2] > 0.5)].mean(axis=1)
