@@ -24,8 +24,10 @@ class DiffusionCoefficients(eqx.Module):
     - `diffusion_coefficient`: `D`, mm.
     - `squared_kappa`: 1/mm^2.
     - `z_e`: extrapolation distance, mm.
+    - `excess`: of an isotropic source, the integral over space of the fluence beyond that which
+      diffuses, mean free paths. Fitted to the transmittance of a slab of eight mean free paths.
     - `lasting`: the fraction of an isotropic source that diffuses; the rest is absorbed within
-      about a mean free path. Fitted to the transmittance of a slab of eight mean free paths.
+      about a mean free path.
     - `inward`: fluence over the irradiance of uniform light that enters, in equilibrium.
 
     **Source:** Case and Zweifel 1967, "Linear Transport Theory".
@@ -36,6 +38,7 @@ class DiffusionCoefficients(eqx.Module):
     diffusion_coefficient: Float[Array, "*channels"]
     squared_kappa: Float[Array, "*channels"]
     z_e: Float[Array, "*channels"]
+    excess: Float[Array, "*channels"]
     lasting: Float[Array, "*channels"]
     inward: Float[Array, "*channels"]
 
@@ -50,5 +53,6 @@ class DiffusionCoefficients(eqx.Module):
         z_e = z_e / (sigma_t * jnp.maximum(albedo, _LEAST_ALBEDO))
         # A half-space that absorbs returns of even light what Chandrasekhar's H gives.
         inward = inward * (1 + 4.5 * loss) / (1 + 4.95 * loss)
-        lasting = 1 - loss * (0.53 + 0.265 * loss)
-        return cls(sigma_t, albedo, diffusion, medium.sigma_a / diffusion, z_e, lasting, inward)
+        excess, squared_kappa = 0.53 + 0.265 * loss, medium.sigma_a / diffusion
+        lasting = 1 - loss * excess
+        return cls(sigma_t, albedo, diffusion, squared_kappa, z_e, excess, lasting, inward)

@@ -261,7 +261,9 @@ def source_integral(
 
     If the faces at its ends are parallel, `phi` fulfills the diffusion equation in between, and
     integration by parts gives the integral in closed form by its values and slopes at the ends, and
-    `Q`. What the far end reflects is light from a thick body behind it.
+    `Q`. Within a mean free path of a surface the fluence is smaller, by the difference of Hopf's
+    function from its limit; around `Q` it is larger by `excess`, of which a surface leaves half.
+    What the far end reflects is light from a thick body behind it.
 
     **Arguments:**
 
@@ -277,7 +279,16 @@ def source_integral(
     bend = (1 - albedo) / spread * mu * mu  # below 1: a solution decays slower than a beam
     at_near = z_e * near.fluence + mu * near.flux
     at_far = (1 - reflected) * z_e * far.fluence - (1 + reflected) * far_mu * far.flux
-    diffused = albedo / spread * (at_near - jnp.exp(-s) * at_far) / (1 - bend)
+    diffused = (at_near - jnp.exp(-s) * at_far) / (1 - bend)
+
+    def along_end(rate, part):
+        exponent = (1 - rate) * part
+        decay = mean_decay(jnp.abs(exponent)) * jnp.exp(jnp.maximum(exponent, 0) - s)
+        return part * decay
+
+    for a, b in _HOPF:
+        along_start = -jnp.expm1(-s * (1 + b * mu)) / (1 + b * mu)
+        diffused -= a * (near.flux * along_start + far.flux * along_end(b * far_mu, s))
     # A beam that enters at one end decays towards the other, at these rates along the ray.
     entering, far_entering = (jnp.maximum(x.entering, GRAZING) for x in (near, far))
     rate, far_rate = mu / entering, far_mu / far_entering
@@ -287,10 +298,9 @@ def source_integral(
     cut = s * far_rate / (rate + far_rate)
     near_part, far_part = s - alike * (s - cut), s - alike * cut
     beams = near.irradiance / (entering + mu) * -jnp.expm1(-near_part * (1 + rate))
-    exponent = (1 - far_rate) * far_part
-    mean = mean_decay(jnp.abs(exponent)) * jnp.exp(jnp.maximum(exponent, 0) - s)
-    beams = beams + far.irradiance / far_entering * far_part * mean
-    return diffused + albedo * beams * (1 - albedo / spread * mu * mu / (1 - bend))
+    beams += far.irradiance / far_entering * along_end(far_rate, far_part)
+    scattered_again = 0.5 * albedo * medium.excess[:, None] - albedo / spread * mu * mu / (1 - bend)
+    return albedo * (diffused / spread + beams * (1 + scattered_again))
 
 
 def _inside(cosine: Float[Array, " splats"], eta: Float[Array, ""]) -> Float[Array, " splats"]:
