@@ -134,6 +134,21 @@ def take_points(
     return taken.reshape(*rows.shape[:-1], len(chosen))
 
 
+def stack_rows(rows: PyTree[Float[Array, "... points"]]) -> Float[Array, "all points"]:
+    """Stack the rows of a tree of arrays."""
+    return jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in jax.tree.leaves(rows)])
+
+
+def split_rows(stacked: Float[Array, "all points"], like: PyTree) -> PyTree:
+    """Undo `stack_rows`, for a tree of arrays that differs from `like` only in its last axis."""
+    leaves, structure = jax.tree.flatten(like)
+    parts = jax.lax.split(stacked, [leaf.size // leaf.shape[-1] for leaf in leaves], axis=0)
+    return structure.unflatten(
+        part.reshape(*leaf.shape[:-1], stacked.shape[1])
+        for part, leaf in zip(parts, leaves, strict=True)
+    )
+
+
 def running(
     combine: Callable[[Array, Array], Array], values: Int[Array, "*rows n"]
 ) -> Int[Array, "*rows n"]:

@@ -130,10 +130,10 @@ class ClusterPlan(AbstractDiffusionPlan):
     - `sources`: the sources of every layer: splats, or clusters of splats.
     - `kernels`: the kernel of every layer.
     - `lists`: the blocks of sources within reach of every block of points.
-    - `point_boxes`, `source_boxes`, `reaches`: for which they were found: boxes of the points and
-      of the sources, and the reach of each layer, mm.
-    - `variances`, `margin`: the plan is valid for variances (mm^2) within the factor `margin` of
-      `variances`, or of the first of them.
+    - `point_boxes`, `source_boxes`, `reaches`: the boxes of points and sources, and the reach of
+      each layer (mm), for which `lists` is complete.
+    - `variances`, `margin`: the plan is valid for variances (mm^2) that differ from these by at
+      most the factor `margin`. Fewer variances are compared with the first of these.
     """
 
     sources: LayerSources

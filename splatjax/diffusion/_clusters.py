@@ -99,7 +99,7 @@ def nested_cells(
     exists: Bool[np.ndarray, " splats"],
     cells: Sequence[float],
 ) -> list[tuple[Int[np.ndarray, " splats"], int]]:
-    """Sort splats into cells by their centers, and these into larger cells by theirs.
+    """Sort splats into cells by their centers, and these cells into larger ones by their means.
 
     A cell contains only splats of one orientation: the two sides of a thin sheet are separate.
 
@@ -139,8 +139,8 @@ def _sums(groups: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _split_by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
-    """Split each group with members of both orientations, by the side of its main axis that they
-    face; number without gaps.
+    """Split each group that has members of both orientations, by the side of its main axis that
+    they face, and number the groups without gaps.
     """
     backs = np.sum(facing * _sums(groups, facing)[groups], axis=1) <= 0
     is_split = np.zeros(groups.max() + 1, bool)

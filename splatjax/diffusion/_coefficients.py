@@ -24,8 +24,8 @@ class DiffusionCoefficients(eqx.Module):
     - `diffusion_coefficient`: `D`, mm.
     - `squared_kappa`: 1/mm^2.
     - `z_e`: extrapolation distance, mm.
-    - `excess`: of an isotropic source, the integral over space of the fluence beyond that which
-      diffuses, mean free paths. Fitted to the transmittance of a slab of eight mean free paths.
+    - `excess`: fluence of an isotropic source beyond that which diffuses, integrated over space,
+      mean free paths. Fitted to the transmittance of a slab of eight mean free paths.
     - `lasting`: the fraction of an isotropic source that diffuses; the rest is absorbed within
       about a mean free path.
     - `inward`: fluence over the irradiance of uniform light that enters, in equilibrium.
@@ -51,7 +51,7 @@ class DiffusionCoefficients(eqx.Module):
         inward = 4 / (1 - fresnel.first_moment(medium.eta))
         z_e = _MILNE / 4 * (1 + fresnel.second_moment(medium.eta)) * inward
         z_e = z_e / (sigma_t * jnp.maximum(albedo, _LEAST_ALBEDO))
-        # A half-space that absorbs returns of even light what Chandrasekhar's H gives.
+        # An absorbing half space then reflects even light as Chandrasekhar's H function does.
         inward = inward * (1 + 4.5 * loss) / (1 + 4.95 * loss)
         excess, squared_kappa = 0.53 + 0.265 * loss, medium.sigma_a / diffusion
         lasting = 1 - loss * excess

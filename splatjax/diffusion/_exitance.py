@@ -21,7 +21,7 @@ from ._shape import ShapeDiffuser
 class ExitanceDiffuser(AbstractDiffuser):
     r"""Sums the weighted layers of another diffuser at the splats, so that passes 2 and 3 blend
     one radiant exitance with its slopes, instead of means, mass and slopes for each layer. A frame
-    takes three quarters of the time, a further frame of an orbit half.
+    takes three quarters of the time, and each further frame of an orbit half.
 
     Each splat has one gain of the kernel, also along its slopes. The picture hardly differs inside;
     along outlines it differs by a few per cent where pixels are wider than splats. `Frame.layers`

@@ -132,13 +132,13 @@ class _Sweep(eqx.Module):
         lists, count = self.lists, len(self.order)
         lanes = min(LANES, count)
         order = jnp.append(self.order, jnp.arange(count, count + -count % lanes, dtype=jnp.int32))
-        sweeps = (jnp.sum(lists.counts > 0) + lanes - 1) // lanes
+        rounds = (jnp.sum(lists.counts > 0) + lanes - 1) // lanes
 
         def step(i, out):
             of_lanes = jax.lax.dynamic_slice_in_dim(order, i * lanes, lanes)
             first, counts = (
-                table.at[of_lanes].get(mode="fill", fill_value=0)
-                for table in (lists.first, lists.counts)
+                per_list.at[of_lanes].get(mode="fill", fill_value=0)
+                for per_list in (lists.first, lists.counts)
             )
             layer, block = jnp.divmod(of_lanes, len(self.ranks))
             kernels = jax.tree.map(lambda leaf: leaf.at[layer].get(mode="clip"), self.kernels)
@@ -160,7 +160,7 @@ class _Sweep(eqx.Module):
 
             return sweep(of_lanes, here, places, each_row, out)
 
-        return jax.lax.fori_loop(jnp.zeros_like(sweeps), sweeps, step, out)
+        return jax.lax.fori_loop(jnp.zeros_like(rounds), rounds, step, out)
 
 
 def _forward(sweeps: _Sweep, points, table: SourceTable):
@@ -170,7 +170,7 @@ def _forward(sweeps: _Sweep, points, table: SourceTable):
     def sweep(_lists, here, places, each_row, sums):
         zeros = jnp.zeros((len(here), count, points.shape[2]), points.dtype)
         lane_sums = each_row(add, zeros)
-        # No place is written twice; else the derivative searches for the last of several values.
+        # The derivative of repeated places would search for the value written last.
         places = sums.at[places]
         return places.set(jnp.swapaxes(lane_sums, 1, 2), mode="drop", unique_indices=True)
 

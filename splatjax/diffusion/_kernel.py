@@ -205,7 +205,7 @@ class EscapeNormalization(AbstractDiffusionKernel):
     def gain(self, mass, variances, energies, single_scattering_albedo):
         energies = jnp.where(energies >= 0, energies, 0.0)
         leaves = jnp.sum(energies, axis=0) + single_scattering_albedo
-        # White is exact only to rounding, so its derivative must not be at a corner.
+        # A sum of 1 is exact only to rounding, so its derivative must not be at a corner.
         absorbed = jnp.where(leaves <= 1 + _SLACK, 1 - leaves, 0.0)
 
         # The decay rate in units of the layer's width, kappa sqrt(v), and its square.
@@ -215,8 +215,8 @@ class EscapeNormalization(AbstractDiffusionKernel):
         squared = (absorbed / jnp.where(diffuses, mean_variance, 1.0))[None] * variance
         decay = jnp.sqrt(jnp.maximum(squared, _TINY_ENERGY))
 
-        # The curvature in the same unit, by the greatest mass of all layers not wider. Not by
-        # `jnp.max`: its derivative asks whether recomputed floats are equal.
+        # The curvature in the same unit, by the greatest mass of all layers not wider. The
+        # derivative of `jnp.max` would compare recomputed floats for equality.
         greatest = jnp.ones_like(variance * mass)
         layers = (jax.lax.split(rows, [1] * len(mass)) for rows in (variance, mass))
         for layer_variance, layer_mass in zip(*layers, strict=True):

@@ -2,6 +2,8 @@
 Gaussians.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -216,8 +218,8 @@ class LayersAtPoints(eqx.Module):
         return root * gain, resolved, local
 
     def _weigh(self, weights, variances, single_scattering_albedo):
-        """Compute the same as `weigh`, for weights that may depend on the point, and variances that
-        may, and may differ slightly from those of the layers; the same as theirs for `None`.
+        """Compute `weigh` for weights and variances that may vary from point to point. The
+        variances may differ slightly from those of the layers, which are used for `None`.
         """
         planned, means, mass = self.variances[:, None, None], self.means, self.mass[:, None]
         if variances is None or self.derivative is None:
@@ -239,7 +241,10 @@ class LayersAtPoints(eqx.Module):
           layers; without it the variances are not used.
         """
         weights, variances = gaussians.weights[:, :, None], gaussians.variances[:, None, None]
-        layers, _ = self._weigh(weights, variances, jnp.zeros_like(weights[0, :, 0]))
+        return self._exitance(weights, variances, jnp.zeros_like(weights[0, :, 0]))
+
+    def _exitance(self, weights, variances, single_scattering_albedo):
+        layers, _ = self._weigh(weights, variances, single_scattering_albedo)
         return jnp.sum(weights * layers, axis=0)
 
     def exitance_jacobian(
@@ -257,10 +262,6 @@ class LayersAtPoints(eqx.Module):
         # Points and channels are independent, so one derivative gives those of all.
         inputs = gaussians.weights[:, :, None], gaussians.variances[:, None, None]
         inputs = tuple(jnp.broadcast_to(array, self.means.shape) for array in inputs)
-
-        def exitance(weights, variances):
-            layers, _ = self._weigh(weights, variances, single_scattering_albedo)
-            return jnp.sum(weights * layers, axis=0)
-
+        exitance = partial(self._exitance, single_scattering_albedo=single_scattering_albedo)
         total, pull = jax.vjp(exitance, *inputs)
         return pull(jnp.ones_like(total))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from splatjax._chunking import split_rows, stack_rows
 from splatjax._smooth import mean_decay
 from splatjax.scattering import reflectance
 from splatjax.scene import Material
@@ -37,7 +38,7 @@ def scattered_once(
     - `kernel`: softened less than on the surface, since the beams decay faster.
     """
     nodes = np.polynomial.legendre.leggauss(_DEPTHS)
-    # Denser at the end of the beam, whose scattering passes through thick parts.
+    # Denser towards the end of the beam: light scattered there crosses thick parts.
     left = (1 - nodes[0]) / 2
     shares, left = (
         jnp.asarray(x, beams.irradiance.dtype)[:, None] for x in (nodes[1] * left, left**2)
@@ -61,6 +62,7 @@ def scattered_once(
         ends = jax.lax.map(of_channel, (beams.directions, first_of == channels))[first_of]
         return ends[channels, channels], ends[:, len(rows) :]
 
+    # The transpose of reading at the exits: it adds power to the splats of the exits.
     _, to_exits, ends = jax.vjp(exits, jnp.zeros_like(beams.irradiance), has_aux=True)
 
     def of_channel(channel):
@@ -70,7 +72,7 @@ def scattered_once(
         is_through = jnp.isfinite(length)
         length = jnp.where(is_through, length, 0.0)
         stopped = jnp.where(is_through, -jnp.expm1(-medium.sigma_t * length), 1.0)
-        # Places along the beam, beyond which the fractions `left` of its scattering take place.
+        # Distances along the beam beyond which the fractions `left` of its scattering take place.
         along = -jnp.log1p((left - 1) * stopped) / medium.sigma_t
         scattered = shares * stopped * (medium.albedo * irradiance)[None]
         # A beam that grazes a convex surface begins and ends on it, and the surface bends over it.
@@ -82,7 +84,7 @@ def scattered_once(
         early_beyond = jnp.where(is_through, (1 - bend) * _leaves_early(beyond, medium), 0.0)
         leaving, emerging = (jnp.sum(part * scattered, axis=0) for part in (early, early_beyond))
         diffuses = (1 - early - early_beyond) * scattered * medium.lasting
-        # The others see the plane of beams below each splat.
+        # What softening removes: the near part of the plane of beams below each splat.
         unseen = channel_kernel.plane_integral(depth[None])[0]
 
         def add(total, plane):
@@ -106,8 +108,8 @@ def _leaves_early(
     depth: Float[Array, "*places"], medium: DiffusionCoefficients
 ) -> Float[Array, "*places"]:
     """Compute the fraction of light first scattered at a depth, mm, that leaves before it diffuses.
-    Deep below an isotropic source, its light is proportional to `tau + q(tau)`, and that of
-    diffusion to `tau + q(inf)`. With absorption the Bond albedo of a half space is right.
+    Far below an isotropic source the fluence is proportional to `tau + q(tau)`, and its diffusing
+    part to `tau + q(inf)`. With absorption the Bond albedo of a half space is right.
     """
     loss, tau = 1 - medium.albedo, depth * medium.sigma_t
     # Fitted to Chandrasekhar's H for albedos from 0.6 to 0.9995, eta 1.
@@ -195,14 +197,9 @@ def at_exits(
     """Follow rays into the body: return the light at their ends, 0 for a ray without an end; the
     cosine of the exit; and the length of the ray, mm, finite for its derivative.
     """
-    leaves, structure = jax.tree.flatten(light)
-    rows = jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in leaves])
-    length, cosine, rows = surface.first_exits(way, starts, rows)
+    length, cosine, rows = surface.first_exits(way, starts, stack_rows(light))
     ends = jnp.isfinite(length)
-    rows = jnp.where(ends[None], rows, 0.0)
-    parts = jnp.split(rows, np.cumsum([leaf.size // leaf.shape[-1] for leaf in leaves])[:-1])
-    shaped = [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)]
-    light = jax.tree.unflatten(structure, shaped)
+    light = split_rows(jnp.where(ends[None], rows, 0.0), light)
     return light, jnp.where(ends, cosine, 1.0), jnp.where(ends, length, _ENDLESS)
 
 
@@ -262,8 +259,8 @@ def source_integral(
     If the faces at its ends are parallel, `phi` fulfills the diffusion equation in between, and
     integration by parts gives the integral in closed form by its values and slopes at the ends, and
     `Q`. Within a mean free path of a surface the fluence is smaller, by the difference of Hopf's
-    function from its limit; around `Q` it is larger by `excess`, of which a surface leaves half.
-    What the far end reflects is light from a thick body behind it.
+    function from its limit; around `Q` it is larger by `excess`, at a surface by half of it. Light
+    that the far end reflects is treated as light from a thick body behind it.
 
     **Arguments:**
 
@@ -292,7 +289,7 @@ def source_integral(
     # A beam that enters at one end decays towards the other, at these rates along the ray.
     entering, far_entering = (jnp.maximum(x.entering, GRAZING) for x in (near, far))
     rate, far_rate = mu / entering, far_mu / far_entering
-    # Light of one direction reaches every point through one end: the nearer one along it.
+    # Light of one direction reaches each point of the ray through one end: along the shorter path.
     alike = jnp.clip(jnp.sum(near.direction * far.direction, axis=0), 0, 1)
     alike = jnp.where((near.entering > 0) & (far.entering > 0), alike, 0.0)
     cut = s * far_rate / (rate + far_rate)

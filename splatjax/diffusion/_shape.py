@@ -44,9 +44,9 @@ class ShapeDiffuser(AbstractDiffuser):
 
         share(x) phi + int (G / z_e + dG/dn_y) phi dA = (1 / D) int G Q dV,    M = D phi / z_e
 
-    - `share` is 1/2 where the surface is smooth, and the body's fraction of the solid angle at
-      creases: a constant solves the equation of the same splats for `kappa = 0`, without source and
-      escape.
+    - `share` is the fraction of the solid angle around x that lies in the body: 1/2 where the
+      surface is smooth. It is computed from the splats, so that a constant fluence solves the
+      equation for `kappa = 0` without source and escape.
     - `z_e = 0.7104 (1 + 3 C2) / (1 - 2 C1) / sigma_s'`, with the moments of the internal
       reflectance (`AbstractFresnel`).
     - Q is light scattered once along the beams, each as long as its path through the body. A part
@@ -99,8 +99,7 @@ class ShapeDiffuser(AbstractDiffuser):
         beams, bounced = padded((beams, bounced))
         coefficients, area = DiffusionCoefficients.of(medium), jnp.sum(surface.areas)
         spread = jnp.sqrt(jnp.sum(surface.areas**2) / area)
-        # A medium without absorption is the limit of a small kappa: the square of this fraction is
-        # neglected.
+        # Without absorption, kappa is small instead of 0; the error is of the order of its square.
         kappa = jnp.sqrt(coefficients.squared_kappa + _LEAST_KAPPA**2 / area)
         kernel = ScreenedKernel(kappa, _SOFTENING * spread)
         finer = ScreenedKernel(kappa, _FINER * kernel.length)
@@ -248,7 +247,7 @@ def solve(
         def step(state):
             count, solution, residual, directions, images = state
             direction, image = residual, product(residual)
-            # Make the image orthogonal to all before; again, for what rounding left.
+            # Orthogonalize the image against all before; twice, because rounding leaves a part.
             for _ in range(2):
                 along = jnp.einsum("msu,su->ms", images, image)
                 image = image - jnp.einsum("ms,msu->su", along, images)

@@ -56,8 +56,8 @@ class SurfaceSums(eqx.Module):
         strengths: Float[Array, "channels splats"],
         dipole: float = 1.0,
     ) -> Float[Array, "channels splats"]:
-        """Compute `int (c G + d dG/dn_y) f dA`, of every channel with its own c, 1/mm, and d the
-        strength of the dipole.
+        """Compute `int (c G + d dG/dn_y) f dA`: c are `charges`, one of each channel, 1/mm; d is
+        `dipole`, and f are `strengths`.
         """
         facing, powers = dipole * self.normals, self.areas[None] * strengths
 
@@ -126,8 +126,8 @@ class SurfaceSums(eqx.Module):
         def far(x, clusters):
             offset = _offset(x, clusters.centers)
             trace, along = _second_moments(clusters.moments, offset)
-            # In thin parts light scatters nearer to the far side than its splats are: the trace,
-            # added to the squared distance, keeps sums finite and positive.
+            # In thin parts light may scatter nearer to the far side than its splats are. The trace,
+            # added to the squared distance, keeps the sums finite and positive.
             ((value, _, twice),) = kernel.far(dot(offset, offset) + 2 * trace)
             return [jnp.sum(clusters.totals * (value + along * twice), axis=1)]
 

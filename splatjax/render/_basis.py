@@ -108,8 +108,8 @@ def diffusion_basis(
             "scene.material has single scattering, with which the light that enters depends "
             "on the weights; render each material separately, or give single_scattering=None"
         )
-    plan = plan_unless_traced(scene, camera, settings, plan)
     check_linear_in_weights(settings)
+    plan = plan_unless_traced(scene, camera, settings, plan)
     scene, plan, light, own_rows = pad_scene(scene, plan, light, camera)
     basis = _diffusion_basis(scene, camera, settings, plan, derivative, light)
     names = "variances", "means", "mass", "derivative", "factors"

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
-from splatjax._chunking import Result, map_chunks, take_points
+from splatjax._chunking import Result, map_chunks, split_rows, stack_rows, take_points
 from splatjax._combination import DeviceMesh
 from splatjax.scene import Scene, stack_lights
 
@@ -34,8 +34,6 @@ from ._surface import (
     SurfaceSamples,
     map_places,
     shade,
-    split_rows,
-    stack_rows,
 )
 
 
@@ -44,7 +42,7 @@ class SplatLight(eqx.Module):
 
     **Attributes:** along the splats, in the order of the plan
 
-    - `visibility`: the visibility of each light.
+    - `visibility`: for each kind of lights the visibility of each sample.
     - `irradiance`: the irradiance that enters, and the part that spreads.
     - `layers`: the layers of pass 4.
     - `derivative`: derivative of the layers with respect to the logarithms of their variances;
@@ -57,7 +55,7 @@ class SplatLight(eqx.Module):
       `None`.
     """
 
-    visibility: list[Float[Array, "_lights splats"] | None]
+    visibility: list[Float[Array, "_samples splats"] | None]
     irradiance: Irradiance
     layers: _diffusion.LayerValues
     derivative: _diffusion.LayerValues | None
@@ -179,21 +177,21 @@ class Passes(eqx.Module):
         enters = _shading.average_transmission(
             _shading.fresnel_f0(material.eta), roughness, material.angular_law()
         ).reshape(material.channels, -1)
-        # The Gaussians also represent light that scatters once: for direct light where it leaves,
-        # for bounced light where it enters.
+        # The Gaussians are scaled to represent light that scatters once too: direct light before
+        # each bounce, bounced light where it enters.
         total, diffused = material.total_reflectance(), material.gaussians.total_reflectance()
-        added = (total / jnp.where(diffused > 0, diffused, 1.0))[:, None]
+        with_single = (total / jnp.where(diffused > 0, diffused, 1.0))[:, None]
 
         def bounce(so_far, _):
             bounced, needed = so_far
-            source = (added * direct.entering + bounced) * root
+            source = (with_single * direct.entering + bounced) * root
             diffused, _ = summed.light(
                 splats, material, source, beams, kernel, self.combination, at, bounced * root
             )
             received = sightlines.irradiance(
                 root[:, at] * diffused.layers.values[0], splats.normals, self.combination
             )
-            return (added * enters * received, jnp.maximum(needed, diffused.needed)), None
+            return (with_single * enters * received, jnp.maximum(needed, diffused.needed)), None
 
         (bounced, needed), _ = jax.lax.scan(
             bounce, (jnp.zeros_like(direct.entering), none), None, length=self.settings.bounces
@@ -266,7 +264,7 @@ class Passes(eqx.Module):
 
         sample = partial(sample_surfaces, visible, rows, origin)
 
-        # A separate call, so that samples are materialized; large chunks, so that few are at once.
+        # A separate call materializes the samples; the chunks bound how many are in memory.
         def sample_and_read(sums, tiles) -> Result:
             samples = map_chunks(sample, sums, tiles, at_once=_splatting.TILES_AT_ONCE)
             return map_places(shade_and_read, samples)

@@ -269,8 +269,8 @@ def arrange(
 
 @eqx.filter_jit
 def _measure(parts: Sequence[Splats], settings: RenderSettings):
-    """Compute the bounds of the splats, the least width of a layer that they resolve, and the
-    weight sum from which on they cover a pixel.
+    """Compute the bounds of the splats, the interval in which layers become resolved, and the
+    settings with the weight sum that covers a pixel.
     """
     splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     uneven, area = _diffusion.unevenness(splats), jnp.sum(splats.areas)

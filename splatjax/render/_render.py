@@ -12,7 +12,7 @@ from splatjax._combination import lay_out
 from splatjax.cache import kept_jit
 from splatjax.diffusion import Sources
 from splatjax.scene import Camera, Frame, Scene
-from splatjax.splatting import PerspectiveView
+from splatjax.splatting import PerspectiveView, invalid_factor
 
 from ._checks import check_channels
 from ._devices import cut_frame, cut_to, on_devices, pad_scene, resize_visibility
@@ -166,7 +166,7 @@ def compute_irradiance(
     **Arguments:** as for `illuminate`.
 
     **Returns:** the irradiance, and the part that spreads, `[channels, splats]` in the order of the
-    scene: `source.T` is the argument of `diffuse_irradiance`.
+    scene: `source.T` is the argument of `diffuse_irradiance`. NaN where the plan does not suffice.
 
     **Raises:** `ValueError` as `illuminate` does.
     """
@@ -180,12 +180,14 @@ def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> I
     _, per_device = splats_per_device(scene.splats.count, plan.mesh)
 
     def entering(passes):
-        irradiance, *_ = passes.irradiance(passes.visibility())
+        light = passes.visibility()
+        irradiance, *_, needed = passes.irradiance(light)
+        needed = passes.combination.largest([jnp.maximum(light.needed, needed)])
         splat = jnp.where(passes.plan.exists, passes.plan.order, per_device)
 
         def in_scene_order(rows):
             dark = jnp.zeros((len(rows), per_device), rows.dtype)
-            return dark.at[:, splat].set(rows, mode="drop")
+            return invalid_factor(needed) * dark.at[:, splat].set(rows, mode="drop")
 
         return jax.tree.map(in_scene_order, irradiance)
 

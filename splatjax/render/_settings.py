@@ -128,12 +128,13 @@ class RenderSettings(eqx.Module):
 
 def check_linear_in_weights(settings: RenderSettings) -> None:
     """Raise `ValueError` for bounces, with which a picture is not linear in the weights, and for a
-    diffuser that applies them at the splats.
+    diffuser without separate layers.
     """
-    if isinstance(settings.diffuser, _diffusion.ExitanceDiffuser):
+    if isinstance(settings.diffuser, _diffusion.ExitanceDiffuser | _diffusion.ShapeDiffuser):
+        layers = getattr(settings.diffuser, "layers", _diffusion.ClusterDiffuser())
         raise ValueError(
-            "settings.diffuser is an ExitanceDiffuser, which sums the layers at the splats; give "
-            f"diffuser={settings.diffuser.layers}"
+            f"settings.diffuser is {type(settings.diffuser).__name__}, which has no separate "
+            f"layers; give diffuser={layers}"
         )
     if settings.bounces:
         raise ValueError(

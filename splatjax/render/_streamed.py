@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import map_chunks
+from splatjax._chunking import map_chunks, stack_rows
 from splatjax._combination import DeviceMesh, PartByPart
 from splatjax._precision import full_precision
 from splatjax.scene import (
@@ -47,7 +47,6 @@ from ._surface import (
     compose,
     map_places,
     shade,
-    stack_rows,
 )
 
 

@@ -27,7 +27,7 @@ def plan_pairs(
 ) -> int:
     """Choose the capacity of pairs of item and tile for each of these numbers of items per tile."""
     pairs = max(int(np.asarray(tiles, np.int64).sum()) for tiles in per_tile)
-    return with_spare(("pairs", grid), max(pairs, 1), _ROW, 2, spare, _CHEAP)
+    return with_spare(("pairs", grid), pairs, _ROW, 2, spare, _CHEAP)
 
 
 class Bins(eqx.Module):
@@ -53,8 +53,8 @@ class Bins(eqx.Module):
     def block(
         self, tiles: Int[Array, " lanes"], number: Int[Array, ""], slots: int
     ) -> Int[Array, "lanes slots"]:
-        """Read one block of each of these tiles' lists: `slots` ids; the number of items in the
-        slots after the end of a list.
+        """Read one block of `slots` ids from the list of each tile. Slots after the end of a list
+        contain the number of items.
         """
         place = (number * slots + jnp.arange(slots, dtype=jnp.int32))[None]
         listed = jnp.where(
@@ -70,7 +70,7 @@ def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
     counts = ranges.across * ranges.down
     ends = running(jnp.add, counts)
     begins, total = ends - counts, ends[-1]
-    # As many items have ended before a pair as lie before its own.
+    # The item of a pair is the number of items whose pairs all precede it.
     ended = jnp.zeros(capacity, jnp.int32).at[ends].add(1, mode="drop")
     item = jnp.minimum(running(jnp.add, ended), counts.shape[0] - 1)
     pair = jnp.arange(capacity, dtype=jnp.int32)

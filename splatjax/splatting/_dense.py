@@ -75,7 +75,7 @@ class DenseRasterPlan(AbstractRasterPlan):
             # The front: fragments nearer than the nearest shifted one.
             front = inside & (nearness > nearest(inside)[:, None])
             in_front = summed(front)
-            # Behind it: the same among all others, from the nearest that weighs something.
+            # Behind it: the same among the remaining ones; the nearest of some weight decides.
             behind = inside & ~front
             weighty = nearest(behind & (weight > least))
             limit = jnp.where(weighty > -jnp.inf, weighty, nearest(behind))

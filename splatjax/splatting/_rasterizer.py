@@ -78,9 +78,10 @@ def coverage(
 def may_show_behind(
     weights: Float[Array, "tiles pixels"], grid: TileGrid, hidden_from: Float[Array, ""]
 ) -> Bool[Array, "tiles pixels"]:
-    """Mark the pixels in which the surface behind the front may be seen, by the sums of weights of
-    the front: below `hidden_from` in a tile with a pixel that the front leaves open, and in the
-    tiles around it, which contain all pixels beside the background; elsewhere below `CLOSED`.
+    """Mark the pixels in which the surface behind may be seen, by the weight sums of the front. In
+    a tile with a pixel that the front leaves open, and in the tiles around it (which contain all
+    pixels beside the background), these are the sums below `hidden_from`; elsewhere, below
+    `CLOSED`.
     """
     has_open = jnp.any(weights < CLOSED, axis=1).reshape(grid.down, grid.across)
     near = lax.reduce_window(has_open, False, lax.bitwise_or, (3, 3), (1, 1), "SAME").reshape(-1)
@@ -179,11 +180,11 @@ class AbstractRasterPlan(eqx.Module):
 
         Fragments are weighted with `fragment_weight`, times the opacity of their footprint. The
         *front* of a pixel are the fragments nearer than `min_i (depth_i + epsilon_i)` (3.1).
-        *Behind* are, in pixels that the front does not cover in full, the fragments nearer than
-        that minimum over those that are not in front and have a weight of at least 0.06 (less for
-        splats smaller than a pixel, `least_weight`): the rims of splats seen nearly edge on do not
-        hide the surface behind them. If no fragment has that weight, the minimum is over all that
-        are not in front.
+        The surface *behind* is computed in pixels that the front does not cover in full: of the
+        remaining fragments, those nearer than the same minimum over the remaining fragments of a
+        weight of at least 0.06 (less for splats smaller than a pixel, `least_weight`), so that the
+        rims of splats seen nearly edge on do not hide the surface behind them. If no fragment has
+        that weight, the minimum is over all that remain.
 
         The choice of fragments is piecewise constant: it has no derivative.
 

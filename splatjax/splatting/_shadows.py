@@ -78,8 +78,8 @@ class ShadowSettings(eqx.Module):
         return self.resolution if self.filled is None else self.filled
 
     def for_spacing(self, spacing: float, bounds: "Bounds") -> "ShadowSettings":
-        """Return the settings with the resolution for a spacing of the splats, mm: a power of 2 at
-        most, so that maps of other bodies share its program. Not for traced arrays.
+        """Return the settings with the resolution for a spacing of the splats, mm: a power of 2, or
+        the given one if smaller, for which other bodies share a program. Not for traced arrays.
         """
         if self.filled is not None:
             return self
@@ -123,8 +123,8 @@ class Bounds(eqx.Module):
 
 
 def _rotation_towards(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Build a rotation whose third row is `forward`; the other two are smooth in it wherever it is
-    not along an axis' flip.
+    """Build a rotation whose third row is `forward`; the other two are smooth in it, except where
+    `|forward_y|` is 0.9.
     """
     up = jnp.where(
         jnp.abs(jax.lax.stop_gradient(forward[1])) < 0.9,

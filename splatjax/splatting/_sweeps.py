@@ -169,8 +169,8 @@ def sum_parts(
     results = []
     for k, capacity in enumerate(capacities):
         spans = jax.tree.map(lambda *pair: jnp.concatenate(pair), fronts[k], behind[k])
-        # Only of the first part: a device has one, or it streams parts for which the capacity of
-        # the lists was planned.
+        # The first part suffices: a device has one part, or a stream for all of whose parts the
+        # capacity of the lists was planned.
         lists = first[k].bins.needed.astype(front_needed[k].dtype)
         needed = jnp.stack([front_needed[k], behind_needed[k], lists])
         needed = combination.largest([jnp.max(needed)])

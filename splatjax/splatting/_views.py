@@ -137,9 +137,9 @@ def widen_ellipse(
     """Widen the ellipse `d^T S^-1 d = 1`, with `S = [[xx, xy], [xy, yy]]`, by the screen filter.
 
     The slope of the splat's plane is given as `det_slope`, which is `det S` times the slope, and
-    `s_slope`, which is `S` times the slope: the slope itself is infinite edge on, so a quarter of a
-    pixel is added to `S` before it is divided by it. Hits stay on the plane of every splat that a
-    pixel can resolve. No terms cancel, so float32 suffices for every slant.
+    `s_slope`, which is `S` times the slope. The slope itself is infinite edge on; a quarter of a
+    pixel is therefore added to `S` before dividing by it. For splats wider than a pixel, hits stay
+    on the plane. No terms cancel, so float32 suffices for every slant.
 
     **Returns:** the numbers a, b, c of `a dx^2 + b dx dy + c dy^2`, which is 1 on the ellipse; the
     slope of the plane along x and y, in the unit of the slopes that were given; xx and yy, the

@@ -45,6 +45,14 @@ def beams(splats: sj.Splats, direction=DOWN, channels: int = 2) -> Beams:
     return Beams(jnp.tile(irradiance, (channels, 1)), directions)
 
 
+def slab(side: float, depth: float, count: int) -> sj.Splats:
+    """Cover a box of side x side x depth; light falls on the face towards +z."""
+    box = trimesh.creation.box([side, side, depth])
+    vertices, faces = box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3)
+    mesh = sj.geometry.Mesh(vertices, faces, np.repeat(box.face_normals, 3, axis=0))
+    return sj.geometry.sample_mesh(mesh, count)
+
+
 exitance_of = eqx.filter_jit(ShapeDiffuser.radiant_exitance)
 
 
@@ -99,10 +107,7 @@ def test_every_channel_has_light_of_its_own(sphere, exitance):
 @pytest.mark.once
 @pytest.mark.parametrize("depth", [2.0, pytest.param(4.0, marks=pytest.mark.long)])
 def test_a_slab_returns_and_lets_through_what_light_transport_does(depth):
-    box = trimesh.creation.box([20, 20, depth])
-    vertices, faces = box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3)
-    mesh = sj.geometry.Mesh(vertices, faces, np.repeat(box.face_normals, 3, axis=0))
-    splats = sj.geometry.sample_mesh(mesh, 4000)
+    splats = slab(20, depth, 4000)
     splats = splats.take(jnp.asarray(compact_order(np.asarray(splats.centers))))
     of_slab, opening = sj.Medium([0.02, 0.1], [0.98, 0.9], 1), ShapeDiffuser().opening
     exitance = solved(splats, of_slab, beams(splats), opening=opening)
@@ -265,10 +270,7 @@ def diffused_in_slab(depth: float, albedo: float) -> np.ndarray:
 def test_the_solution_between_planes_is_the_closed_form():
     albedo = np.asarray([0.98, 0.9])
     expected = np.stack([diffused_in_slab(4.0, a) for a in albedo], axis=1)
-    box = trimesh.creation.box([24, 24, 4])
-    vertices, faces = box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3)
-    mesh = sj.geometry.Mesh(vertices, faces, np.repeat(box.face_normals, 3, axis=0))
-    splats = sj.geometry.sample_mesh(mesh, 5000)
+    splats = slab(24, 4, 5000)
     exitance = solved(splats, sj.Medium(1 - albedo, albedo, 1), beams(splats), 1e-6)
     is_inner = np.all(np.abs(splats.centers[:, :2]) < 1.5, axis=1)
     sides = (is_inner & (side * splats.normals[:, 2] > 0.5) for side in (1, -1))
@@ -291,6 +293,31 @@ def test_refused_bodies_and_materials(sphere):
     turned = dataclasses.replace(sphere, normals=-sphere.normals)
     for body, remedy in ((half, "close the mesh"), (turned, "turn them around")):
         bodies.assert_refused(lambda b=body: ShapeDiffuser().find_hierarchy(b), remedy)
+
+
+# Of a slab of 4 mean free paths under perpendicular light, albedo 0.98: the radiance towards these
+# cosines, times pi over the irradiance, in front and behind; 3 million walks, 0.4%.
+COSINES = 0.95, 0.75, 0.45, 0.25
+SEEN = [[0.5842, 0.6037, 0.6214, 0.6196], [0.2721, 0.2454, 0.1977, 0.1590]]
+
+
+@pytest.mark.long
+@pytest.mark.once
+@pytest.mark.parametrize(("side", "expected"), zip((1, -1), SEEN, strict=True))
+def test_a_slab_has_the_radiance_of_light_transport_at_every_angle(side, expected):
+    of_slab = sj.Medium([0.02] * 2, [0.98] * 2, 1)
+    material = sj.Material(GAUSSIANS, eta=1.0, specular=0.0, medium=of_slab)
+    light = sj.DirectionalLight(DOWN, [1.0, 1.0], cast_shadows=False)
+    scene = sj.Scene(slab(24, 4, 5000), [light], material)
+    settings = dataclasses.replace(bodies.PLAIN, diffuser=ShapeDiffuser())
+    plan, found = None, []
+    for cosine in COSINES:
+        away = 200 * np.asarray([np.sqrt(1 - cosine**2), 0, side * cosine])
+        middle = np.asarray([0, 0, 2.0 * side])
+        camera = sj.Camera.look_at(middle + away, middle, fov=0.5, width=8, height=8)
+        plan = plan or sj.make_plan(scene, camera, settings)
+        found.append(np.pi * np.asarray(sj.render(scene, camera, settings, plan).diffuse).mean())
+    np.testing.assert_allclose(found, expected, rtol=0.025)
 
 
 @pytest.mark.long

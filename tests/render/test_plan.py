@@ -58,10 +58,20 @@ def test_a_plan_of_several_scenes_has_room_for_the_shadows_of_each():
     assert pairs(back) < pairs(front) == pairs(back, front) == pairs(front, back)
 
 
+def under_lamp_at(z: float) -> sj.Scene:
+    return scene_under(sj.PointLight(jnp.asarray([0.0, 0.0, z]), jnp.ones(3)))
+
+
+def test_light_for_which_a_plan_does_not_suffice_is_nan():
+    far, near = map(under_lamp_at, (30.0, 1.0))
+    plan = sj.make_plan(far, CAMERA, SETTINGS)
+    for scene, is_lost in ((far, False), (near, True)):
+        light = sj.compute_irradiance(scene, plan, SETTINGS)
+        assert np.all(np.isnan(light.source) == is_lost)
+
+
 def test_a_lamp_among_the_splats_in_one_scene_has_six_faces_in_all():
-    far, near = (
-        scene_under(sj.PointLight(jnp.asarray([0.0, 0.0, z]), jnp.ones(3))) for z in (30.0, 1.0)
-    )
+    far, near = map(under_lamp_at, (30.0, 1.0))
     assert sj.make_plan([far, near], CAMERA, SETTINGS).shadows[0].cube
     assert not sj.make_plan([far, far], CAMERA, SETTINGS).shadows[0].cube
 

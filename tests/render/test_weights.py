@@ -126,7 +126,7 @@ def of_a_sum(function, *light):
 MEDIUM = sj.Medium([0.02, 0.05], [0.9, 1.2], 1.3)
 SINGLE = replace(WHITE, single_scattering=sj.SingleScattering(MEDIUM))
 SOLVED = replace(WHITE, medium=MEDIUM), replace(PLAIN, diffuser=ShapeDiffuser())
-ONES = np.ones((2, 2))
+SEEN, ONES = (view(), SOLVED[1]), np.ones((2, 2))
 REFUSED = [
     (lambda: factored(np.ones((3, 2))), "splats.weights.*3 Gaussians.*2"),
     (lambda: factored(np.ones((2, 3))), "splats.weights has 3 channels"),
@@ -135,6 +135,10 @@ REFUSED = [
     (lambda: factored(-ONES), r"Splats.weights must be.*-1"),
     (lambda: of_a_sum(sj.diffusion_basis), "DenseDiffuser"),
     (lambda: of_a_sum(sj.picture_jacobian), "DenseDiffuser"),
+    (
+        lambda: sj.diffusion_basis(replace(scene(sphere(100)), material=SOLVED[0]), *SEEN),
+        "ShapeDiffuser.*ClusterDiffuser",
+    ),
     (
         lambda: of_a_sum(sj.diffuse_irradiance, jnp.ones((100, 3))),
         "ExitanceDiffuser has no separate layers",
