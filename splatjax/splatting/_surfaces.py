@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._chunking import AT_ONCE, zeros_after
 from splatjax._combination import DeviceMesh
+from splatjax._smooth import smooth_step
 from splatjax.scene import Splats
 
 from ._grid import TILE_SIDE, TileGrid
@@ -24,6 +25,8 @@ from ._views import CLOSED, AbstractView, SplattingSettings
 
 TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2  # tiles in a chunk of values computed chunk by chunk
 _BESIDE = 2  # pixels; a pixel this near an open one is beside the background
+# The distance, in gaps between two surfaces, over which a third one ceases to be the second.
+_ALIKE = 0.75, 0.25
 
 
 def blend_fragments(
@@ -41,26 +44,41 @@ def blend_fragments(
 
 
 def coverages(
-    front: Float[Array, "tiles pixels"],
-    behind: Float[Array, "tiles pixels"],
+    weights: Float[Array, "surfaces tiles pixels"],
+    nearness: Float[Array, "surfaces tiles pixels"],
     grid: TileGrid,
     full: float | Float[Array, ""],
-) -> tuple[Float[Array, "tiles pixels"], Float[Array, "tiles pixels"]]:
+) -> Float[Array, "surfaces tiles pixels"]:
     r"""Compute the fraction of each pixel that the front surface covers, and the one behind it.
 
     Coverage is a smooth step of the sum of weights; the surface behind covers this fraction of the
     part that the front leaves open. Within two pixels of a pixel that both leave open, the step
     ends at `full`, so that outlines are where the body ends. Elsewhere it ends at a sum that
     surfaces reach even in creases and between randomly scattered splats, so nothing shines through.
+    At an edge before another surface, within two pixels of which the front recedes to the surface
+    behind, the front yields to it what lies beyond the step that ends at `full`.
 
-    **Arguments:** `front`, `behind`: sums of weights. Differentiable.
+    **Arguments:** of the front, and of the surface behind it
+
+    - `weights`: sums of weights. Differentiable.
+    - `nearness`: blended nearness; 0 without a surface. Differentiable.
     """
-    is_open = grid.join(((1 - coverage(front)) * (1 - coverage(behind)))[:, None])
+    (front, behind), (near, far) = weights, nearness
+    open_share = (1 - coverage(front)) * (1 - coverage(behind))
+    remoteness = jnp.where(front > 0, -near, -jnp.inf)
+    planes = grid.join(jnp.stack([open_share, remoteness], axis=1))
     window = 1, 2 * _BESIDE + 1, 2 * _BESIDE + 1
-    beside = jax.lax.reduce_window(is_open, -jnp.inf, jax.lax.max, window, (1, 1, 1), "SAME")
-    closed = CLOSED + grid.cut(beside)[:, 0] * (full - CLOSED)
-    of_front = coverage(front, closed)
-    return of_front, (1 - of_front) * coverage(behind, closed)
+    planes = jax.lax.reduce_window(planes, -jnp.inf, jax.lax.max, window, (1, 1, 1), "SAME")
+    beside, farthest = jnp.moveaxis(grid.cut(planes), 1, 0)
+    # How far the front recedes near the pixel, relative to the gap to the surface behind.
+    is_apart = (front > 0) & (behind > 0) & (near > far)
+    gap = jnp.where(is_apart, near - far, 1.0)
+    receded = jnp.where(is_apart, near + farthest, 0.0) / gap
+    edge = smooth_step(jnp.abs(receded - 1), *_ALIKE)
+    closed = CLOSED + beside * (full - CLOSED)
+    of_front, of_behind = coverage(front, closed), coverage(behind, closed)
+    yielded = edge * (of_front - coverage(front, full)) * of_behind
+    return jnp.stack([of_front - yielded, (1 - of_front) * of_behind + yielded])
 
 
 class Surface(eqx.Module):
@@ -120,12 +138,13 @@ class VisibleSurfaces(eqx.Module):
         grid = TileGrid(view.width, view.height)
         in_front = jnp.arange(len(sums.tiles)) < sums.front
         own = combination.own_share(sums.sums)
-        # The weights of both surfaces in all tiles, gathered from all devices.
-        weights = combination.gather(own.weights)
-        of_tiles = jnp.zeros((2, grid.count, TILE_SIDE**2), weights.dtype)
+        # The sums of weights and nearness of both surfaces in all tiles, from all devices.
+        rows = combination.gather(jnp.stack([own.weights, own.rows[:, -1]]), axis=1)
+        of_tiles = jnp.zeros((2, 2, grid.count, TILE_SIDE**2), rows.dtype)
         surface = 1 - in_front.astype(jnp.int32)
-        of_tiles = of_tiles.at[surface, sums.tiles].set(weights, mode="drop")
-        shares = jnp.stack(coverages(*of_tiles, grid, settings.covered_from))
+        weights, nearness = of_tiles.at[:, surface, sums.tiles].set(rows, mode="drop")
+        nearness = blend_fragments(nearness, weights)
+        shares = coverages(weights, nearness, grid, settings.covered_from)
         shares = shares.at[surface, sums.tiles].get(mode="fill", fill_value=0)
         return cls(
             view=view,
