@@ -10,7 +10,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from splatjax._precision import full_precision
+from splatjax._chunking import jit_unless_traced
 from splatjax._records import as_floats, require
 from splatjax.render import Plan, RenderSettings, render
 from splatjax.scene import Material, Splats
@@ -45,8 +45,7 @@ class Evaluation(eqx.Module):
     counted: Float[Array, "height width"]
 
 
-@full_precision
-@eqx.filter_jit
+@jit_unless_traced
 def evaluate(
     x: Coordinates,
     scene: MovableScene,
@@ -69,8 +68,7 @@ def evaluate(
     return Evaluation(value, gradient, frame.overflow, frame.beauty, counted)
 
 
-@full_precision
-@eqx.filter_jit
+@jit_unless_traced
 def advance(
     x: Coordinates,
     state: PyTree,

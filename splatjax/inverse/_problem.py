@@ -10,7 +10,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._precision import full_precision
+from splatjax._chunking import jit_unless_traced
 from splatjax.diffusion import resolved_fraction
 from splatjax.fitting import AbstractModel, AbstractWeights, GivenVariances, fit_gaussians
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
@@ -246,8 +246,7 @@ class RecoveryProblem(eqx.Module):
         return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in residuals])
 
 
-@full_precision
-@eqx.filter_jit
+@jit_unless_traced
 def search(
     problem: RecoveryProblem, start: Float[Array, " unknowns"]
 ) -> tuple[Float[Array, " unknowns"], Float[Array, ""], Int[Array, ""], Bool[Array, ""]]:
@@ -275,8 +274,7 @@ def search(
     )
 
 
-@full_precision
-@eqx.filter_jit
+@jit_unless_traced
 def solution(
     problem: RecoveryProblem, point: Float[Array, " unknowns"]
 ) -> tuple[

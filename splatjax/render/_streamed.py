@@ -6,15 +6,13 @@ import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import map_chunks, stack_rows
+from splatjax._chunking import jit_unless_traced, map_chunks, stack_rows
 from splatjax._combination import DeviceMesh, PartByPart
-from splatjax._precision import full_precision
 from splatjax.scene import (
     AbstractLight,
     AbstractLightSample,
@@ -216,8 +214,7 @@ def _sum_views(
     return [sums for sums, _ in summed]
 
 
-@full_precision
-@eqx.filter_jit
+@jit_unless_traced
 def _light(
     scene: Scene,
     groups: list[StackedLights],
@@ -238,8 +235,7 @@ def _light(
     return light, irradiance_at_splats(scene, light)
 
 
-@full_precision
-@eqx.filter_jit
+@jit_unless_traced
 def _sample(
     sums: _splatting.FragmentSums,
     view: _splatting.AbstractView,
@@ -254,8 +250,7 @@ def _sample(
     )
 
 
-@full_precision
-@eqx.filter_jit
+@jit_unless_traced
 def _shade(
     scene: Scene,
     view: _splatting.PerspectiveView,

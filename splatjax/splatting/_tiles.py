@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import (
+    jit_unless_traced,
     list_chosen,
     map_chunks,
     needed_over_planned,
@@ -18,7 +19,6 @@ from splatjax._chunking import (
     with_spare,
 )
 from splatjax._combination import DeviceMesh
-from splatjax._precision import full_precision
 from splatjax.cache import reuse_capacity
 from splatjax.scene import Splats
 
@@ -152,8 +152,7 @@ class TilePlan(AbstractRasterPlan):
         sweep_settings, *binned = self._bin(splats, attributes, view, settings)
         return sum_tile_fragments(sweep_settings, self.places, combination, *binned)
 
-    @full_precision
-    @eqx.filter_jit
+    @jit_unless_traced
     def part_sweep(
         self,
         splats: Splats,
