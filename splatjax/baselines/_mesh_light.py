@@ -7,11 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax import splatting as _splatting
-from splatjax.render import Irradiance, LightVisibility, irradiance_at_splats
+from splatjax.render import Irradiance, LightVisibility, irradiance_at_splats, shadow_views
 from splatjax.scene import (
     AbstractLightSample,
     AbstractPointSample,
-    DirectionalLight,
     Material,
     Scene,
     Splats,
@@ -63,19 +62,10 @@ def light_views(
 ) -> list[_splatting.AbstractView | None]:
     """Return the view of each light; `None` for a light without shadows."""
     bounds = mesh.bounds()
-    views: list[_splatting.AbstractView | None] = []
-    for light in lights:
-        if not light.cast_shadows:
-            views.append(None)
-        elif isinstance(light, DirectionalLight):
-            views.append(_splatting.distant_view(light.direction, bounds, settings))
-        elif isinstance(light, AbstractPointSample):
-            views.append(_splatting.near_view(light.position, bounds, settings))
-        else:
-            raise ValueError(
-                f"{type(light).__name__} has no shadow map for a mesh; give cast_shadows=False"
-            )
-    return views
+    return [
+        shadow_views(light, bounds, settings, cube=False)[0] if light.cast_shadows else None
+        for light in lights
+    ]
 
 
 def shadow_capacities(

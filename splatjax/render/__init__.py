@@ -24,6 +24,7 @@ from ._lighting import (
     irradiance_at_points as irradiance_at_points,
     irradiance_at_splats as irradiance_at_splats,
     LightVisibility as LightVisibility,
+    shadow_views as shadow_views,
     Transfer as Transfer,
 )
 from ._passes import SplatLight as SplatLight
