@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from splatjax import shading as _shading, splatting as _splatting
 from splatjax._records import is_traced
-from splatjax.render import LightVisibility
+from splatjax.render import LightVisibility, surface_parameters
 from splatjax.scene import AbstractLightSample, Camera, Frame, Material
 
 from ._mesh_light import MeshLight, mesh_light, shadow_capacities
@@ -148,16 +148,11 @@ def _shaded(
     f0 = _shading.fresnel_f0(material.eta)
     to_eye = view.position[None] - points.centers
     surface = _shading.SurfacePoints(
-        positions=points.centers,
-        normals=points.normals,
-        outgoing=_shading.unit_normals(to_eye),
-        specular=material.specular
-        if points.specular is None
-        else material.specular * points.specular,
-        roughness=material.roughness
-        if points.roughness is None
-        else material.roughness * points.roughness,
-        visibility=received.visibility,
+        points.centers,
+        points.normals,
+        _shading.unit_normals(to_eye),
+        *surface_parameters(material, points),
+        received.visibility,
     )
     covered = seen.seen.covered
     drawn = jnp.where(needed <= 1, 1.0, jnp.nan) * covered.reshape(-1, 1).astype(depth.dtype)

@@ -25,6 +25,7 @@ from ._lighting import (
     irradiance_at_splats as irradiance_at_splats,
     LightVisibility as LightVisibility,
     shadow_views as shadow_views,
+    surface_parameters as surface_parameters,
     Transfer as Transfer,
 )
 from ._passes import SplatLight as SplatLight

@@ -18,6 +18,7 @@ from splatjax.scene import (
     GaussianBeam,
     Material,
     Scene,
+    Splats,
     StackedLights,
     stack_lights,
 )
@@ -211,7 +212,6 @@ def map_visibility(
     """Compute the splats' visibility from one map; 0 for splats of another cube face."""
     visibility = _splatting.compute_visibility(scene.splats, shadow_map, settings)
     if cube:
-        assert isinstance(shadow_map.view, _splatting.PerspectiveView)
         visibility *= _splatting.in_cube_face(shadow_map.view, scene.splats.centers.T)
     return visibility
 
@@ -247,7 +247,7 @@ def irradiance_at_points(
 
 def irradiance_at_splats(scene: Scene, light: LightVisibility) -> Irradiance:
     """Compute the light that enters every splat."""
-    splats, (_, roughness) = scene.splats, surface_parameters(scene)
+    splats, (_, roughness) = scene.splats, surface_parameters(scene.material, scene.splats)
     return irradiance_at_points(
         scene.material, light, splats.centers, splats.normals, splats.albedo, roughness
     )
@@ -279,16 +279,17 @@ def single_scattering_at_splats(
         splats.centers,
         splats.normals,
         _shading.unit_normals(eye[None] - splats.centers),
-        *surface_parameters(scene),
+        *surface_parameters(scene.material, splats),
         light.visibility,
     )
     f0 = _shading.fresnel_f0(scene.material.eta)
     return _shading.single_scattered_radiance(points, light.groups, f0, single)
 
 
-def surface_parameters(scene: Scene) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+def surface_parameters(
+    material: Material, splats: Splats
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Multiply the material's specular strength and roughness with the splats' own."""
-    material, splats = scene.material, scene.splats
     specular = material.specular if splats.specular is None else material.specular * splats.specular
     factor = splats.roughness
     return specular, material.roughness if factor is None else material.roughness * factor
@@ -304,7 +305,7 @@ def beams_at_splats(
     - `irradiance`: from `irradiance_at_splats`.
     """
     splats, material = scene.splats, scene.material
-    f0, roughness = _shading.fresnel_f0(material.eta), surface_parameters(scene)[1]
+    f0, (_, roughness) = _shading.fresnel_f0(material.eta), surface_parameters(material, splats)
     reflects = _shading.albedo_under(light.groups, f0, roughness)
 
     def along(axis: int):

@@ -173,7 +173,7 @@ class Passes(eqx.Module):
         summed = _diffusion.ExitancePlan.of(self.plan.diffusion, self.plan.interval)
         splats, albedo, kernel = self.scene.splats, self.scene.splats.albedo, self.settings.kernel
         root = jnp.ones_like(direct.source) if albedo is None else _shading.albedo_root(albedo.T)
-        _, roughness = surface_parameters(self.scene)
+        _, roughness = surface_parameters(material, splats)
         enters = _shading.average_transmission(
             _shading.fresnel_f0(material.eta), roughness, material.angular_law()
         ).reshape(material.channels, -1)

@@ -40,7 +40,7 @@ class AbstractLighting(eqx.Module):
         subclass adds its own as `extra`.
         """
         splats = scene.splats
-        specular, roughness = surface_parameters(scene)
+        specular, roughness = surface_parameters(scene.material, splats)
         return SurfaceAttributes(
             normals=splats.normals.T,
             area=splats.areas[None],

@@ -186,9 +186,7 @@ def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[Pe
     ]
 
 
-def in_cube_face(
-    view: PerspectiveView, points: Float[Array, "3 splats"]
-) -> Float[Array, " splats"]:
+def in_cube_face(view: AbstractView, points: Float[Array, "3 splats"]) -> Float[Array, " splats"]:
     """Mark (1 or 0) the points that belong to a face of the cube: those whose largest coordinate is
     along its axis.
     """
