@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from splatjax.splatting import AbstractView, blend_fragments
 
 from ._kernels import AbstractSplatKernel
-from ._tiles import AbstractListRasterizer, Lists
+from ._tiles import AbstractListRasterizer, TileLists
 
 
 class BlendingRasterizer(AbstractListRasterizer):
@@ -25,7 +25,7 @@ class BlendingRasterizer(AbstractListRasterizer):
     kernel: AbstractSplatKernel
 
     def front(
-        self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView
+        self, lists: TileLists, attributes: Float[Array, "attributes splats"], view: AbstractView
     ) -> Float[Array, "places rows pixels"]:
         def nearest(ids, footprints, dx, dy):
             fragments = self.kernel.fragments(footprints, view, dx, dy)

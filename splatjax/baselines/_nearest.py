@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from splatjax.splatting import AbstractView
 
 from ._kernels import AbstractSplatKernel, DiscKernel
-from ._tiles import AbstractListRasterizer, Lists
+from ._tiles import AbstractListRasterizer, TileLists
 
 
 class NearestRasterizer(AbstractListRasterizer):
@@ -19,7 +19,7 @@ class NearestRasterizer(AbstractListRasterizer):
     kernel: AbstractSplatKernel = DiscKernel()
 
     def front(
-        self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView
+        self, lists: TileLists, attributes: Float[Array, "attributes splats"], view: AbstractView
     ) -> Float[Array, "places rows pixels"]:
         def nearest(ids, footprints, dx, dy):
             fragments = self.kernel.fragments(footprints, view, dx, dy)

@@ -58,7 +58,7 @@ class AbstractListRasterizer(AbstractRasterizer):
 
     @abc.abstractmethod
     def front(
-        self, lists: "Lists", attributes: Float[Array, "attributes splats"], view: AbstractView
+        self, lists: "TileLists", attributes: Float[Array, "attributes splats"], view: AbstractView
     ) -> Float[Array, "places rows pixels"]:
         """Compute the rows of the front surface, as in `FragmentSums`, lane by lane of the
         lists.
@@ -89,7 +89,7 @@ class ListPlan(AbstractRasterPlan):
         ends = jnp.concatenate([running(jnp.add, lengths), jnp.full(1, self.blocks, jnp.int32)])
         block = jnp.arange(self.blocks, dtype=jnp.int32)
         chunk = jnp.searchsorted(ends, block, side="right").astype(jnp.int32)
-        lists = Lists(footprints, bins, chunk, ends[chunk] - 1 - block, grid)
+        lists = TileLists(footprints, bins, chunk, ends[chunk] - 1 - block, grid)
         rows = self.rasterizer.front(lists, attributes, view)
         rows = jnp.where(grid.within_picture(bins.order)[:, None], rows, 0.0)
         tiles = jnp.minimum(bins.order, grid.count)
@@ -98,7 +98,7 @@ class ListPlan(AbstractRasterPlan):
         return FragmentSums(tiles, sums, needed.astype(rows.dtype), len(rows))
 
 
-class Lists(eqx.Module):
+class TileLists(eqx.Module):
     """The splats of every tile, in blocks of `[lanes, slots]`; the blocks of a chunk contain the
     lists of the same tiles, and are numbered.
     """

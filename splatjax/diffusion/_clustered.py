@@ -24,7 +24,7 @@ from ._diffuser import (
 )
 from ._gaussian_sums import SourceTable, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
-from ._neighbors import Boxes, Lists, find_neighbors
+from ._neighbors import Boxes, NeighborLists, find_neighbors
 
 # Quantile of the areas of the splats: a layer is resolved as far as splats of that area resolve it.
 FINE_QUANTILE = 0.01
@@ -138,7 +138,7 @@ class ClusterPlan(AbstractDiffusionPlan):
 
     sources: LayerSources
     kernels: TruncatedGaussian
-    lists: Lists
+    lists: NeighborLists
     point_boxes: Boxes
     source_boxes: Boxes
     reaches: Float[Array, " layers"]
@@ -205,7 +205,7 @@ def layer_sums(
     points: Float[Array, "blocks 3 block"],
     below: Sources,
     layers: Int[Array, " source_blocks"],
-    lists: Lists,
+    lists: NeighborLists,
     variances: Float[Array, " layers"],
     kernels: TruncatedGaussian,
     at: Int[Array, " targets"] | None = None,

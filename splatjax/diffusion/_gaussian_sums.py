@@ -18,7 +18,7 @@ from splatjax._chunking import zeros_after
 from splatjax._precision import full_precision
 
 from ._kernel import TruncatedGaussian
-from ._neighbors import Lists
+from ._neighbors import NeighborLists
 
 LANES = 256  # lists that are swept together
 FAR = -1e6  # coordinate far from all points in every unit used, with a square finite in float32
@@ -77,7 +77,7 @@ class SourceTable(eqx.Module):
         )
 
 
-class _Sweep(eqx.Module):
+class _SweptLists(eqx.Module):
     """The lists that are swept, and the targets: the points at which sums are computed. Not
     differentiated.
 
@@ -92,7 +92,7 @@ class _Sweep(eqx.Module):
     """
 
     kernels: TruncatedGaussian
-    lists: Lists
+    lists: NeighborLists
     order: Int[Array, " lists"]
     ranks: Int[Array, "points_blocks block"]
     count: int = eqx.field(static=True)
@@ -101,10 +101,10 @@ class _Sweep(eqx.Module):
     def of(
         cls,
         kernels: TruncatedGaussian,
-        lists: Lists,
+        lists: NeighborLists,
         at: Int[Array, " targets"] | None,
         shape: tuple[int, int],
-    ) -> "_Sweep":
+    ) -> "_SweptLists":
         """Choose the points `at` of all points, in blocks of a shape."""
         count, counts = shape[0] * shape[1], lists.counts
         ranks = jnp.arange(count, dtype=jnp.int32)
@@ -113,14 +113,14 @@ class _Sweep(eqx.Module):
             ranks = (ranks + count).at[at].set(ranks[:count], mode="drop")
             is_target = jnp.any(ranks.reshape(shape) < count, axis=1)
             counts = jnp.where(is_target, counts.reshape(-1, len(is_target)), 0).reshape(-1)
-        lists, order = Lists(lists.rows, lists.first, counts), jnp.argsort(-counts)
+        lists, order = NeighborLists(lists.rows, lists.first, counts), jnp.argsort(-counts)
         return cls(kernels, lists, order.astype(jnp.int32), ranks.reshape(shape), count)
 
-    def sweep(
-        self, sweep: Callable, points: Float[Array, "lists 3 block"], table: SourceTable, out
+    def each_round(
+        self, function: Callable, points: Float[Array, "lists 3 block"], table: SourceTable, out
     ):
-        """Apply `sweep(lists, points, places, each_row, out)` to all lists with a row, `LANES` of
-        them at a time.
+        """Apply `function(lists, points, places, each_row, out)` to all lists with a row, `LANES`
+        of them at a time.
 
         Each lane has a list (distinct numbers beyond all lists for none), its points, and their
         places: indices of the layer, of all sums, and of the points among the sums.
@@ -158,16 +158,16 @@ class _Sweep(eqx.Module):
 
                 return jax.lax.fori_loop(0, jnp.max(counts), add_row, carry)
 
-            return sweep(of_lanes, here, places, each_row, out)
+            return function(of_lanes, here, places, each_row, out)
 
         return jax.lax.fori_loop(jnp.zeros_like(rounds), rounds, step, out)
 
 
-def _forward(sweeps: _Sweep, points, table: SourceTable):
+def _forward(swept: _SweptLists, points, table: SourceTable):
     def add(_ids, sources: SourceTable, weights, _slopes, sums):
         return sums + jnp.einsum("lrs,lsp->lrp", sources.rows_and_moments(), weights)
 
-    def sweep(_lists, here, places, each_row, sums):
+    def sum_lanes(_lists, here, places, each_row, sums):
         zeros = jnp.zeros((len(here), count, points.shape[2]), points.dtype)
         lane_sums = each_row(add, zeros)
         # The derivative of repeated places would search for the value written last.
@@ -175,8 +175,10 @@ def _forward(sweeps: _Sweep, points, table: SourceTable):
         return places.set(jnp.swapaxes(lane_sums, 1, 2), mode="drop", unique_indices=True)
 
     count = len(table.rows) * (4 if table.moments else 1)
-    shape = len(sweeps.kernels.largest), count, sweeps.count
-    return sweeps.sweep(sweep, points, table, zeros_after(table.rows[0], shape, points.dtype))
+    shape = len(swept.kernels.largest), count, swept.count
+    return swept.each_round(
+        sum_lanes, points, table, zeros_after(table.rows[0], shape, points.dtype)
+    )
 
 
 @full_precision
@@ -191,9 +193,9 @@ def _backward(residuals, cotangents):
     Both are moments of `g` over one side. Points and sources are relative to one of the sources, so
     that float32 does not cancel.
     """
-    sweeps, points, table = residuals
+    swept, points, table = residuals
 
-    def sweep(lists, here, places, each_row, carry):
+    def add_cotangents(lists, here, places, each_row, carry):
         cotangent = cotangents.at[places].get(mode="fill", fill_value=0).swapaxes(1, 2)
 
         def add(ids, sources: SourceTable, weights, minus_slopes, carry):
@@ -223,7 +225,7 @@ def _backward(residuals, cotangents):
     start = jax.tree.map(
         lambda array: zeros_after(cotangents, array.shape, array.dtype), (points, table)
     )
-    return sweeps.sweep(sweep, points, table, start)
+    return swept.each_round(add_cotangents, points, table, start)
 
 
 _sums = jax.custom_vjp(_forward)
@@ -236,7 +238,7 @@ _sums.defvjp(
 def gaussian_sums(
     points: Float[Array, "layers points_blocks 3 block"],
     table: SourceTable,
-    lists: Lists,
+    lists: NeighborLists,
     kernels: TruncatedGaussian,
     at: Int[Array, " targets"] | None = None,
     forward_mode: bool = False,
@@ -251,7 +253,7 @@ def gaussian_sums(
     - `at`: the points of the sums, beyond all points for none; all for `None`.
     - `forward_mode`: differentiable only in forward mode, otherwise only in reverse mode. Static.
     """
-    sweeps = _Sweep.of(kernels, lists, at, (points.shape[1], points.shape[3]))
+    swept = _SweptLists.of(kernels, lists, at, (points.shape[1], points.shape[3]))
     # The loops have their own derivatives in forward mode.
     sums = _forward if forward_mode else _sums
-    return sums(sweeps, points.reshape(-1, *points.shape[2:]), table)
+    return sums(swept, points.reshape(-1, *points.shape[2:]), table)

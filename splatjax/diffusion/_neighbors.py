@@ -22,7 +22,7 @@ Corners = tuple[Float[np.ndarray, "_boxes 3"], Float[np.ndarray, "_boxes 3"]]
 Pairs = tuple[Int[np.ndarray, " _pairs"], Int[np.ndarray, " _pairs"]]
 
 
-class Lists(eqx.Module):
+class NeighborLists(eqx.Module):
     """The blocks of sources in the lists of the blocks of points, for every layer. Not
     differentiated.
 
@@ -72,7 +72,7 @@ def find_neighbors(
     layers: Int[Array, " blocks"] | Int[np.ndarray, " blocks"],
     reaches: Sequence[float],
     parts: int = 1,
-) -> Lists:
+) -> NeighborLists:
     """Search for the blocks of sources within reach of every block of points, layer by layer.
 
     The number of rows is rounded up, so that similar geometries share a program. Not for traced
@@ -111,7 +111,7 @@ def find_neighbors(
         np.pad(part, ((0, count - len(part)), (0, 0)), constant_values=len(low)) for part in rows
     ]
     joined = (np.concatenate(table) for table in (rows, first, counts))
-    return Lists(*(jnp.asarray(table, jnp.int32) for table in joined))
+    return NeighborLists(*(jnp.asarray(table, jnp.int32) for table in joined))
 
 
 def in_rows(

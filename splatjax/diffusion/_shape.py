@@ -108,19 +108,19 @@ class ShapeDiffuser(AbstractDiffuser):
         exists = (surface.areas > 0)[None]
         ones, z_e = jnp.ones_like(surface.areas)[None], coefficients.z_e
         zero = jnp.zeros(1, z_e.dtype)
-        share = -surface.layers(ScreenedKernel(zero, kernel.length), zero, ones)
+        share = -surface.layer_potentials(ScreenedKernel(zero, kernel.length), zero, ones)
         # The part that softening removes uses phi of its own splat.
         unseen = kernel.plane_integral(jnp.zeros_like(z_e)[:, None])
         diagonal = jnp.where(exists, share + unseen / z_e[:, None], 1.0)
 
         def product(phi):
-            return phi + surface.layers(kernel, 1 / z_e, phi) / diagonal
+            return phi + surface.layer_potentials(kernel, 1 / z_e, phi) / diagonal
 
         flux = (coefficients.diffusion_coefficient / z_e)[:, None]
         if bounced is not None:
             leaving = leaving + (1 - flux * coefficients.inward[:, None]) * bounced
             inward = (coefficients.inward / z_e)[:, None] * bounced
-            single_layer = surface.layers(kernel, jnp.ones_like(z_e), inward, dipole=0.0)
+            single_layer = surface.layer_potentials(kernel, jnp.ones_like(z_e), inward, dipole=0.0)
             source = source + single_layer + unseen * inward
         right = jnp.where(exists, source / diagonal, 0.0)
         return (flux * solve(product, right, self.error) + leaving)[:, :count]

@@ -49,7 +49,7 @@ class SurfaceSums(eqx.Module):
         bends = bends / jnp.where(clusters.totals > 0, clusters.totals, 1.0)[None]
         return cls(hierarchy, centers, normals, areas, clusters, bends)
 
-    def layers(
+    def layer_potentials(
         self,
         kernel: ScreenedKernel,
         charges: Float[Array, " channels"],

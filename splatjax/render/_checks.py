@@ -17,7 +17,7 @@ BYTES_PER_SPLAT, BYTES_PER_PIXEL = 1000.0, 500.0
 _SAMPLE = 4096  # largest number of splats, evenly chosen, used to estimate a body's shape
 # Largest area-weighted normal sum of a closed body, divided by its area. The sum is 0.08 for an
 # open neck and 0.5 for a hemisphere.
-_CLOSED = 0.15
+_OPEN = 0.15
 _SOLID = 0.05  # least volume of a body (not a sheet), over that of a sphere of its area
 # Scattering distance, mm, up to which a material is intentionally opaque (`Material.opaque`).
 _OPAQUE = 2e-3
@@ -117,7 +117,7 @@ def _warnings(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
             )
     areas = areas * (scene.splats.count / len(areas))
     area = max(np.sum(areas), np.finfo(float).tiny)
-    is_closed = np.linalg.norm(areas @ normals) < _CLOSED * area
+    is_closed = np.linalg.norm(areas @ normals) < _OPEN * area
     middle = areas @ centers / area
     volume = areas @ np.sum(normals * (centers - middle), axis=1) / 3
     sphere = area**1.5 / (6 * np.sqrt(np.pi))
