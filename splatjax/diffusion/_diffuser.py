@@ -131,7 +131,6 @@ class AbstractDiffusionPlan(eqx.Module):
         material = dataclasses.replace(scene.material, gaussians=one_layer)
         return Scene(dataclasses.replace(scene.splats, weights=None), scene.lights, material)
 
-    @abc.abstractmethod
     def diffuse(
         self,
         sources: Sources,
@@ -152,7 +151,13 @@ class AbstractDiffusionPlan(eqx.Module):
         - `combination`: combines the parts of the splats of several devices.
         - `at`: the splats at which the layers are evaluated, in ascending order, padded by the
           number of splats. All for `None`.
+
+        **Raises:** `ValueError` for a plan without separate layers.
         """
+        raise ValueError(
+            f"{type(self).__name__} has no separate layers, and evaluates only the light of a "
+            "scene; make the plan with ClusterDiffuser()"
+        )
 
     def light(
         self,

@@ -97,8 +97,3 @@ class ExitancePlan(AbstractDiffusionPlan):
             return LayerValues(total[None], jnp.sum(of_means[:, :, None] * slopes, axis=0)[None])
 
         return Diffused(exitance(diffused.layers, *along_splats), diffused.needed), None
-
-    def diffuse(self, sources, variances, kernel, combination, at=None):
-        raise ValueError(
-            "ExitanceDiffuser has no separate layers; give settings with the diffuser that it sums"
-        )

@@ -217,12 +217,6 @@ class ShapePlan(AbstractDiffusionPlan):
         radiance = radiance_towards(eye, surface, material, solved, padded(seen))
         return LayerValues(take_points(radiance, at)[None], layers.slopes)
 
-    def diffuse(self, sources, variances, kernel, combination, at=None):
-        raise ValueError(
-            "ShapeDiffuser solves for the lights of a scene, not for a given irradiance, nor for "
-            "derivatives by Gaussians; render with ClusterDiffuser"
-        )
-
 
 def solve(
     product: Callable, right: Float[Array, "systems unknowns"], error: float

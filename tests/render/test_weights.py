@@ -141,7 +141,7 @@ REFUSED = [
     ),
     (
         lambda: of_a_sum(sj.diffuse_irradiance, jnp.ones((100, 3))),
-        "ExitanceDiffuser has no separate layers",
+        "ExitancePlan has no separate layers",
     ),
     (lambda: ExitanceDiffuser(ShapeDiffuser()), "layers is a ShapeDiffuser"),
     (lambda: ExitanceDiffuser(ExitanceDiffuser()), "layers is a ExitanceDiffuser"),
