@@ -73,11 +73,11 @@ def cut_frame(frame: Frame, camera: Camera) -> Frame:
 
 
 def pad_scene(
-    scene: Scene, plan: Plan, light: Kept | None = None, *trees: PyTree
+    scene: Scene, plan: Plan, light: Kept | None = None, camera: Camera | None = None
 ) -> tuple[Scene, Plan, Kept | None, OwnRows]:
     """Pad the splats of a scene to the length of its plan, the lights of each kind to four or a
     larger power of two, the Gaussians and the angles. NumPy and `device_put` are used, to compile
-    nothing. If the scene or `trees` is traced, or splats are divided over devices, nothing changes.
+    nothing. If scene or camera is traced, or splats are divided over devices, nothing changes.
 
     The plan's order has no entry for a padding splat. A padding light has no strength and no shadow
     map; a padding Gaussian has no weight. If a light of the scene consists of several samples, or
@@ -98,7 +98,7 @@ def pad_scene(
     scene = Scene(scene.splats, scene.lights, material)
     layers = len(plan.diffusion.shown(scene).material.gaussians.variances)
     own_rows = OwnRows(np.arange(len(scene.lights)), np.arange(min(plan.gaussians, layers)))
-    if plan.mesh is not None or is_traced((scene, light, trees)):
+    if plan.mesh is not None or is_traced((scene, light, camera)):
         return scene, plan, light, own_rows
     splats, lights, shadows = scene.splats, scene.lights, plan.shadows
     if 0 < splats.count < len(plan.order):
