@@ -14,7 +14,6 @@ from splatjax.scene import (
     AbstractLightSample,
     AbstractPointSample,
     DirectionalLight,
-    DistantStratum,
     GaussianBeam,
     Material,
     Scene,
@@ -80,7 +79,7 @@ def shadow_views(
     cube: bool,
 ) -> Sequence[_splatting.AbstractView]:
     """Return the views of a light's shadow maps: one of all splats, or the six faces of a cube."""
-    if isinstance(light, DirectionalLight | GaussianBeam | DistantStratum):
+    if isinstance(light, DirectionalLight | GaussianBeam):
         return [_splatting.distant_view(light.direction, bounds, settings)]
     if not isinstance(light, AbstractPointSample):
         raise ValueError(

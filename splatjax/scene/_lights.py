@@ -266,28 +266,19 @@ class SpotLight(AbstractPointSample):
         return wi, irradiance * smooth_step(cosine, outer, inner)[..., None]
 
 
-class DistantStratum(AbstractLightSample):
-    """A part of an environment, as parallel light: fields as of `DirectionalLight`."""
-
-    direction: Float[Array, "3"]
-    irradiance: Float[Array, " channels"]
-    strength_field: ClassVar[str] = "irradiance"
-    cast_shadows: bool = eqx.field(static=True, default=True)
-    incidence = DirectionalLight.incidence
+class DistantStratum(DirectionalLight):
+    """A part of an environment, as parallel light."""
 
 
-class EmitterStratum(AbstractPointSample):
-    """A part of an area light, as a point: fields as of `PointLight`.
+class EmitterStratum(PointLight):
+    """A part of an area light, as a point.
 
     **Attributes:**
 
     - `normal`: unit; the intensity falls off with the cosine to it. `None`: even on all sides.
     """
 
-    position: Float[Array, "3"]
-    intensity: Float[Array, " channels"]
-    normal: Float[Array, "3"] | None
-    cast_shadows: bool = eqx.field(static=True, default=True)
+    normal: Float[Array, "3"] | None = None
 
     def incidence(
         self, points: Float[Array, "*points 3"]
