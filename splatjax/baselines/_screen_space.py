@@ -67,7 +67,7 @@ class GaussianPasses(AbstractScreenKernel):
 class AbstractOneKernel(AbstractScreenKernel):
     """One kernel for the whole profile, a few taps along rows and the same along columns."""
 
-    samples: eqx.AbstractVar[int]
+    samples: int = eqx.field(static=True, default=25)
 
     @abc.abstractmethod
     def taps(
@@ -97,8 +97,6 @@ class ShippedKernel(AbstractOneKernel):
     **Source:** Jimenez et al. 2015, and the code that comes with it.
     """
 
-    samples: int = eqx.field(static=True, default=25)
-
     def taps(self, gaussians):
         return separable_kernel(gaussians, self.samples)
 
@@ -109,8 +107,6 @@ class PreintegratedKernel(AbstractOneKernel):
 
     **Source:** Jimenez et al. 2015, section 3.2.
     """
-
-    samples: int = eqx.field(static=True, default=25)
 
     def taps(self, gaussians):
         offsets, _ = separable_kernel(gaussians, self.samples)
