@@ -56,8 +56,7 @@ def plan_texture_space(
     capacities = capacity_for(in_texture), capacity_for(in_view)
     texels = rasterize_in_texture(mesh, settings.resolution, capacities[0])
     valid = texels.seen.covered.astype(mesh.vertices.dtype)
-    extents = stretch_map(mesh, texels)
-    taken = jnp.stack(settings.stretch.millimeters(*extents, valid))
+    taken = settings.stretch.millimeters(stretch_map(mesh, texels), valid)
     reaches = reaches_of(material.gaussians.variances, taken, valid)
     return TexturePlan(*capacities, shadow_capacities(mesh, lights, settings.shadows), reaches)
 

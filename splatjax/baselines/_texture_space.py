@@ -29,27 +29,23 @@ class AbstractStretch(eqx.Module):
 
     @abc.abstractmethod
     def millimeters(
-        self,
-        along_u: Float[Array, "height width"],
-        along_v: Float[Array, "height width"],
-        valid: Float[Array, "height width"],
-    ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
-        """Convert a texel's extent along u and v, mm, to the extent that the blur uses."""
+        self, extents: Float[Array, "2 height width"], valid: Float[Array, "height width"]
+    ) -> Float[Array, "2 height width"]:
+        """Convert a texel's extents along u and v, mm, to the extents that the blur uses."""
 
 
 class StretchCorrected(AbstractStretch):
     """Every texel has its own extent, along u and along v: the stretch map of d'Eon and Luebke."""
 
-    def millimeters(self, along_u, along_v, valid):
-        return along_u, along_v
+    def millimeters(self, extents, valid):
+        return extents
 
 
 class Uncorrected(AbstractStretch):
     """One extent for the whole texture: the root of the mean area of a texel."""
 
-    def millimeters(self, along_u, along_v, valid):
-        mean = jnp.sqrt(jnp.sum(valid * along_u * along_v) / jnp.sum(valid))
-        return jnp.full_like(along_u, mean), jnp.full_like(along_v, mean)
+    def millimeters(self, extents, valid):
+        return jnp.full_like(extents, _mean_extent(extents, valid))
 
 
 class TextureSpaceSettings(eqx.Module):
@@ -102,9 +98,15 @@ def stretch_map(mesh: TexturedMesh, texels: SurfaceTexels) -> Float[Array, "2 he
     """Compute every texel's extent along u and v, mm; between the charts, the average extent."""
     seen = texels.seen
     along = jnp.stack(mesh.lengths())[:, seen.faces] / seen.faces.shape[0]
-    valid = seen.covered.astype(along.dtype)
-    mean = jnp.sqrt(jnp.sum(valid * along[0] * along[1]) / jnp.sum(valid))
+    mean = _mean_extent(along, seen.covered.astype(along.dtype))
     return jnp.where(seen.covered[None], along, mean)
+
+
+def _mean_extent(
+    extents: Float[Array, "2 height width"], valid: Float[Array, "height width"]
+) -> Float[Array, ""]:
+    """Compute the root of the mean area of the texels on the charts, mm."""
+    return jnp.sqrt(jnp.sum(valid * extents[0] * extents[1]) / jnp.sum(valid))
 
 
 def reaches_of(
@@ -151,11 +153,9 @@ def diffuse_in_texture(
     entering = light.entering(texels.points, material)
     valid = texels.seen.covered.astype(entering.source.dtype)
     extents = stretch_map(mesh, texels)
-    taken = jnp.stack(settings.stretch.millimeters(*extents, valid))
+    taken = settings.stretch.millimeters(extents, valid)
     variances = material.gaussians.variances
-    average = (
-        jnp.sqrt(jnp.sum(valid * extents[0] * extents[1]) / jnp.sum(valid)) * settings.resolution
-    )
+    average = _mean_extent(extents, valid) * settings.resolution
     far = settings.thin_parts.far_side(texels, light, jnp.sqrt(jnp.max(variances)), average)
     rows = [texels.picture(entering.source.T).transpose(2, 0, 1), taken]
     if far is not None:
