@@ -41,7 +41,7 @@ class ThinnedDiffuser(AbstractDiffuser):
 
     keep: int = eqx.field(static=True)
 
-    def make_plan(self, parts, variances, kernel, interval):
+    def make_plan(self, splats, variances, kernel, interval, devices=1):
         return ThinnedPlan(jnp.arange(len(variances), dtype=jnp.int32), self.keep)
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -51,15 +50,13 @@ class ClusterDiffuser(AbstractDiffuser):
 
     def make_plan(
         self,
-        parts: Sequence[Splats],
+        splats: Splats,
         variances: Float[Array, " gaussians"],
         kernel: AbstractDiffusionKernel,
         interval: Float[Array, "2"],
+        devices: int = 1,
     ) -> "ClusterPlan":
-        centers, normals, areas = (
-            np.concatenate([np.asarray(getattr(part, name)) for part in parts])
-            for name in ("centers", "normals", "areas")
-        )
+        centers, normals, areas = map(np.asarray, (splats.centers, splats.normals, splats.areas))
         exists, spacing, fine = areas > 0, math.inf, math.inf
         if exists.any():
             spacing = math.sqrt(areas[exists].mean())
@@ -76,7 +73,7 @@ class ClusterDiffuser(AbstractDiffuser):
         # Sources of a wider layer lie deeper than those of the boxes.
         sinking = math.sqrt(3) * np.asarray(sinking, np.float64)
         reaches = np.where(edges < np.inf, supports * np.sqrt(sizes * self.margin) + sinking, 0)
-        lists = find_neighbors(points, boxes, clusters.layers, reaches.tolist(), len(parts))
+        lists = find_neighbors(points, boxes, clusters.layers, reaches.tolist(), devices)
         endless = jnp.asarray(np.where(reaches > 0, reaches, np.inf), variances.dtype)
         return ClusterPlan(
             gaussians=jnp.asarray(gaussians, jnp.int32),

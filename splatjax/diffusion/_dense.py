@@ -27,7 +27,7 @@ _AT_ONCE = 64  # points evaluated together
 class DenseDiffuser(AbstractDiffuser):
     """Sums over every splat at every splat. Slow."""
 
-    def make_plan(self, parts, variances, kernel, interval):
+    def make_plan(self, splats, variances, kernel, interval, devices=1):
         return DensePlan(jnp.arange(len(variances), dtype=jnp.int32))
 
 

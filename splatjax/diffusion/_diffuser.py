@@ -229,21 +229,23 @@ class AbstractDiffuser(eqx.Module):
     @abc.abstractmethod
     def make_plan(
         self,
-        parts: list[Splats],
+        splats: Splats,
         variances: Float[Array, " gaussians"],
         kernel: AbstractDiffusionKernel,
         interval: Float[Array, "2"],
+        devices: int = 1,
     ) -> AbstractDiffusionPlan:
         """Plan the evaluation of Gaussians of these variances on this geometry. Not for traced
         arrays.
 
         **Arguments:**
 
-        - `parts`: the splats, each part in the compact order in which they will be diffused
-          (`compact_order`) and filled up to whole blocks by splats without area; several parts
-          where several devices hold them.
+        - `splats`: the splats of one device after the other, each in the compact order in which
+          they will be diffused (`compact_order`) and filled up to whole blocks by splats without
+          area.
         - `interval`: standard deviations per spacing between which layers become resolved
           (`AbstractDiffusionKernel.interval`).
+        - `devices`: the number of devices, each of which has as many of the splats.
         """
 
 

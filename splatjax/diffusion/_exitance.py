@@ -42,8 +42,9 @@ class ExitanceDiffuser(AbstractDiffuser):
                 "to sum; use it directly, or give ClusterDiffuser()"
             )
 
-    def make_plan(self, parts, variances, kernel, interval):
-        return ExitancePlan.of(self.layers.make_plan(parts, variances, kernel, interval), interval)
+    def make_plan(self, splats, variances, kernel, interval, devices=1):
+        plan = self.layers.make_plan(splats, variances, kernel, interval, devices)
+        return ExitancePlan.of(plan, interval)
 
 
 class ExitancePlan(AbstractDiffusionPlan):

@@ -163,13 +163,13 @@ class ShapeDiffuser(AbstractDiffuser):
         least = SOFTENED * _SOFTENING * np.sqrt(np.sum(areas**2) / area)
         return Hierarchy.build(np.pad(centers, ((0, more), (0, 0))), exists, self.opening, least)
 
-    def make_plan(self, parts, variances, kernel, interval):
-        if len(parts) > 1:
+    def make_plan(self, splats, variances, kernel, interval, devices=1):
+        if devices > 1:
             raise ValueError(
-                f"ShapeDiffuser works on one device, not on {len(parts)}; make the plan without a "
+                f"ShapeDiffuser works on one device, not on {devices}; make the plan without a "
                 "mesh, or render with ClusterDiffuser"
             )
-        return ShapePlan(jnp.zeros(1, jnp.int32), self, self.find_hierarchy(parts[0]))
+        return ShapePlan(jnp.zeros(1, jnp.int32), self, self.find_hierarchy(splats))
 
 
 class ShapePlan(AbstractDiffusionPlan):

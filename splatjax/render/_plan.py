@@ -133,7 +133,9 @@ def make_plan(
         if (view.width, view.height) != (camera.width, camera.height)
     ]
     parts, order, exists = _cut_and_order(scene.splats, mesh)
-    bounds, interval, splatting = _measure(parts, settings)
+    # Only the rasterizer plans device by device; the others, for the splats of all.
+    splats = parts[0] if mesh is None else jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+    bounds, interval, splatting = _measure(splats, settings)
     gaussians = scene.material.gaussians
     raster = settings.rasterizer.make_plan(parts, views, settings.splatting)
     plan = Plan(
@@ -144,12 +146,12 @@ def make_plan(
             for group in _groups([scene.lights for scene in (scene, *other_scenes)])
         ),
         diffusion=settings.diffuser.make_plan(
-            parts, pad_gaussians(gaussians).variances, settings.kernel, interval
+            splats, pad_gaussians(gaussians).variances, settings.kernel, interval, len(parts)
         ),
         interval=interval,
         splatting=splatting,
-        raster=raster.fitted(parts, views, splatting),
-        sightlines=_splatting.Sightlines.build(parts, settings.sightlines)
+        raster=raster.fitted(splats, views, splatting, len(parts)),
+        sightlines=_splatting.Sightlines.build(splats, settings.sightlines)
         if settings.bounces
         else None,
         mesh=mesh,
@@ -268,11 +270,10 @@ def arrange(
 
 
 @eqx.filter_jit
-def _measure(parts: Sequence[Splats], settings: RenderSettings):
+def _measure(splats: Splats, settings: RenderSettings):
     """Compute the bounds of the splats, the interval in which layers become resolved, and the
     settings with the weight sum that covers a pixel.
     """
-    splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     uneven, area = _diffusion.unevenness(splats), jnp.sum(splats.areas)
     square = jnp.sum(jnp.where(splats.areas > 0, splats.radii**2, 0.0))
     discs = jnp.where(area > 0, square / jnp.where(area > 0, area, 1.0), 1.0)

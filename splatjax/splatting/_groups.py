@@ -2,8 +2,6 @@
 between groups, by bundles of parallel lines.
 """
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -104,8 +102,8 @@ class Sightlines(eqx.Module):
     size: int = eqx.field(static=True)
 
     @classmethod
-    def build(cls, parts: Sequence[Splats], settings: SightlineSettings) -> "Sightlines":
-        """Compute the visibility between the splats of all parts, by NumPy.
+    def build(cls, splats: Splats, settings: SightlineSettings) -> "Sightlines":
+        """Compute the visibility between splats, by NumPy.
 
         For every line, splats are sorted into cells across it, and by depth along it. A splat sees
         the next one in its cell that faces it. Each must be in front of the other's plane by half a
@@ -113,15 +111,12 @@ class Sightlines(eqx.Module):
 
         **Arguments:**
 
-        - `parts`: concrete, in the order of a plan; splats without area are padding.
+        - `splats`: concrete, in the order of a plan; splats without area are padding.
         """
         size = 1
-        while size < _LARGEST_GROUP and sum(part.count for part in parts) > _MOST_GROUPS * size:
+        while size < _LARGEST_GROUP and splats.count > _MOST_GROUPS * size:
             size *= 2
-        centers, normals, areas = (
-            np.concatenate([np.asarray(getattr(part, name)) for part in parts])
-            for name in ("centers", "normals", "areas")
-        )
+        centers, normals, areas = map(np.asarray, (splats.centers, splats.normals, splats.areas))
         areas = areas.reshape(-1, size)
         total = np.maximum(areas.sum(axis=1), np.finfo(areas.dtype).tiny)
         centers, normals = (

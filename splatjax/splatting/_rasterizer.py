@@ -198,11 +198,15 @@ class AbstractRasterPlan(eqx.Module):
         """
 
     def fitted(
-        self, parts: Sequence[Splats], views: Sequence[AbstractView], settings: SplattingSettings
+        self,
+        splats: Splats,
+        views: Sequence[AbstractView],
+        settings: SplattingSettings,
+        devices: int = 1,
     ) -> "AbstractRasterPlan":
         """Return a plan with the capacity for the surface behind reduced to the need of these
-        views, with some to spare. With many attributes it is most of the memory. Not for traced
-        arrays.
+        views of all splats, with some to spare. With many attributes it is most of the memory. Not
+        for traced arrays.
         """
         return self
 

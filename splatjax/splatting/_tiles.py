@@ -116,19 +116,20 @@ class TilePlan(AbstractRasterPlan):
     places: SurfaceCapacity
 
     def fitted(
-        self, parts: Sequence[Splats], views: Sequence[AbstractView], settings: SplattingSettings
+        self,
+        splats: Splats,
+        views: Sequence[AbstractView],
+        settings: SplattingSettings,
+        devices: int = 1,
     ) -> "TilePlan":
-        joined, plan = parts[0], self
-        if len(parts) > 1:
-            joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-            plan = self.rasterizer.make_plan([joined], views, settings)
+        plan = self if devices == 1 else self.rasterizer.make_plan([splats], views, settings)
         # Coarse capacities, so that other bodies and pictures of the size share the program.
         grid = self.rasterizer.grid(views[0])
         every_tile = SurfaceCapacity(grid.padded_count, grid.padded_count)
-        seen = min(1 << plan.splats.bit_length(), joined.count)
+        seen = min(1 << plan.splats.bit_length(), splats.count)
         coarse = TilePlan(self.rasterizer, seen, 1 << plan.pairs.bit_length(), every_tile)
-        most = max(int(_tiles_behind(joined, view, settings, coarse)) for view in views)
-        grain = math.lcm(self.rasterizer.lanes * -(-grid.half // 8), len(parts))
+        most = max(int(_tiles_behind(splats, view, settings, coarse)) for view in views)
+        grain = math.lcm(self.rasterizer.lanes * -(-grid.half // 8), devices)
         capacity = -(-int(_SPARE * most + 1) // grain) * grain
         cheap = max(2.0, _CHEAP / capacity)
         behind = reuse_capacity(("behind", grid, grain), int(1.25 * most) + 1, capacity, cheap)

@@ -59,7 +59,7 @@ def scene(count=COUNT) -> tuple[Splats, Sources]:
 
 
 def planned(diffuser, body: Splats, variances=VARIANCES):
-    return diffuser.make_plan([body], jnp.asarray(variances), KERNEL, RESOLVED)
+    return diffuser.make_plan(body, jnp.asarray(variances), KERNEL, RESOLVED)
 
 
 @eqx.filter_jit

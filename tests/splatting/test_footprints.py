@@ -279,7 +279,7 @@ def test_a_surface_is_covered_however_evenly_its_splats_are_spread(jitter):
     assert np.mean(coverage < 0.99) < 5e-4
     # Where nothing is seen through it, nothing is looked for behind it.
     settings, rasterizer = by_default(body), TileRasterizer(lanes=4, slots=4)
-    plan = rasterizer.make_plan([body], [view], settings).fitted([body], [view], settings)
+    plan = rasterizer.make_plan([body], [view], settings).fitted(body, [view], settings)
     assert plan.places.behind < plan.places.front / 4
 
 

@@ -162,7 +162,7 @@ def test_too_small_a_capacity_makes_the_picture_nan_and_is_reported():
     """Never a wrong picture; and where there is little behind the front, little capacity for it."""
     view, body = bodies.perspective(width=96, height=96), bodies.bumpy(500)
     whole = TileRasterizer(lanes=2, slots=16).make_plan([body], [view], SETTINGS)
-    plan = whole.fitted([body], [view], SETTINGS)
+    plan = whole.fitted(body, [view], SETTINGS)
     assert plan.places.behind < whole.places.behind
     few = dataclasses.replace(plan.places, behind=2)
     for short in ({}, {"splats": 100}, {"pairs": 1024}, {"places": few}):
