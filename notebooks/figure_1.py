@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Figure 1: splats, their surface, and light below it
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 1, from the
+# Figure 1 of "Subsurface scattering using splat-based diffusion in point-based rendering", with the
 # built-in bust. `make figures` writes the picture; `docs/figures.md` describes it.
 
 # %%
@@ -30,7 +30,7 @@ from splatjax.plots import plot_pictures
 
 # %% [markdown]
 # The bust is scaled to 0.3 of its size, so that few splats resolve the diffusion of light in skin.
-# One light casts shadows, and a weak one does not.
+# One light casts shadows; a second, weak light does not.
 
 # %%
 body = sj.bust(40_000).scaled(0.3)
@@ -44,9 +44,9 @@ lights = (
 skin = sj.load_material("skin").white()
 
 # %% [markdown]
-# Left: some of the splats, as discs with gaps between them. Middle: the surface of all splats
-# without scattering, where light leaves the skin at its point of entry. Right: the same surface
-# with scattering.
+# The left picture shows some of the splats as discs with gaps between them. The middle shows the
+# surface of all splats without scattering, so that light leaves the skin where it enters. The right
+# shows the same surface with scattering.
 
 # %%
 step = body.count // 3000
@@ -63,8 +63,8 @@ plot_pictures(
 )
 
 # %% [markdown]
-# The numbers are the ratios of the light that leaves the skin in the shadow of the first light,
-# with and without scattering. Red travels farthest into the shadow.
+# The numbers compare the light that leaves the skin in the shadow of the first light with and
+# without scattering. Red light travels farthest into the shadow.
 
 # %%
 shadow = (np.asarray(middle.coverage) > 0.99) & (np.asarray(middle.shadow)[0] < 1e-3)

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Figure 3: a Gaussian on each splat, and their sum, the profile
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 3. `make
-# figures` writes the picture; `docs/figures.md` describes it.
+# Figure 3 of "Subsurface scattering using splat-based diffusion in point-based rendering".
+# `make figures` writes the picture; `docs/figures.md` describes it.
 
 # %%
 # %matplotlib inline
@@ -26,9 +26,9 @@ from matplotlib.figure import Figure
 import splatjax as sj
 
 # %% [markdown]
-# Top: the Gaussian of each layer on a splat, all at one scale and over five decades of brightness,
-# with the weights of red, green and blue. Bottom: the profile of each channel, and the layers whose
-# sum it is.
+# The upper row shows the Gaussian of each layer on a splat with the weights of red, green and blue,
+# all at the same scale and over five decades of brightness. The lower row shows the profile of each
+# channel, and the layers that sum to it.
 
 # %%
 skin = sj.load_material("skin").gaussians
@@ -53,8 +53,8 @@ axes.set(xlabel="r (mm)", ylabel="R(r) (1/mm²)", yscale="log", xlim=(0, reach),
 figure  # noqa: B018
 
 # %% [markdown]
-# The numbers are the root mean square distances that light travels in each channel. Red travels
-# farthest.
+# The numbers are the root mean square distances that light travels in each channel. Red light
+# travels farthest.
 
 # %%
 totals = skin.total_reflectance()

@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Figure 4: the layers of a picture
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 4, from the
+# Figure 4 of "Subsurface scattering using splat-based diffusion in point-based rendering", with the
 # built-in bust. `make figures` writes the picture; `docs/figures.md` describes it.
 
 # %%
@@ -28,7 +28,7 @@ from splatjax.plots import plot_pictures
 
 # %% [markdown]
 # The bust is scaled to 0.15 of its size, so that few splats resolve the diffusion of light in skin.
-# One light casts shadows, and a weak one does not.
+# One light casts shadows; a second, weak light does not.
 
 # %%
 body = sj.bust(40_000).scaled(0.15)
@@ -42,10 +42,10 @@ lights = (
 skin = sj.load_material("skin").white()
 
 # %% [markdown]
-# Top: the layers, the narrowest first. Bottom: the contribution of each to the picture, by its
-# weights for red, green and blue. Blue and green stay near their entry, red travels farther. The
-# layers are the means of the paper; the default kernel would make curved parts of the wide layers
-# brighter (`docs/bodies.md`).
+# The upper row shows the layers, the narrowest first. The lower row shows the contribution of each
+# layer to the picture, with its weights for red, green and blue. Blue and green light leaves near
+# its point of entry; red light travels farther. The layers are plain means as in the paper. The
+# default kernel would make curved parts of the wide layers brighter (`docs/bodies.md`).
 
 # %%
 settings = sj.RenderSettings(kernel=sj.diffusion.PlainMean())
@@ -55,7 +55,8 @@ titles = [f"{float(variance) ** 0.5:.2g} mm" for variance in skin.gaussians.vari
 plot_pictures([layers, weights[:, None, None] * layers], titles, ["layer", "what it adds"])
 
 # %% [markdown]
-# The numbers are the roughness of each layer: the mean step from pixel to pixel inside the body.
+# The numbers measure the roughness of each layer by the mean difference between neighboring pixels
+# inside the body.
 
 # %%
 inside = np.asarray(frame.coverage) > 0.99

@@ -13,8 +13,9 @@
 # %% [markdown]
 # # Figure 5: wider splats, fewer splats
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 5, from the
-# built-in bust. `make figures` writes the picture; `docs/figures.md` has the law of these errors.
+# Figure 5 of "Subsurface scattering using splat-based diffusion in point-based rendering", with the
+# built-in bust. `make figures` writes the picture; `docs/figures.md` explains the law of these
+# errors.
 
 # %%
 # %matplotlib inline
@@ -27,8 +28,8 @@ from splatjax.diffusion import PlainMean
 from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# The bust is lit by one light with shadows and a weak one without. Its layers are two, four and
-# eight times as wide as the spacing of its splats.
+# One light casts shadows; a second, weak light does not. The layers are two, four and eight times
+# as wide as the spacing of the splats.
 
 # %%
 body = sj.bust(20_000)
@@ -46,9 +47,9 @@ scene = sj.Scene(body, lights, sj.Material(gaussians, specular=0.0))
 
 # %% [markdown]
 # The radius increases to the right, and the number of splats decreases downwards. The quality is
-# constant along a diagonal: a radius twice as large allows a quarter of the splats. The numbers are
-# root mean square errors over that of the layer, and the prediction of the law with one fitted
-# factor.
+# constant along a diagonal, because a radius twice as large allows a quarter of the splats. The
+# numbers are root mean square errors, relative to the root mean square of the layer, and the
+# predictions of the law with one fitted factor.
 
 # %%
 settings = [
@@ -73,5 +74,5 @@ law = np.asarray(
 print("measured", np.round(measured, 3), "by the law", np.round(law, 3), sep="\n")
 
 # %%
-# The law is fitted to the mean over many selections of splats; the worst single layer is 1.63 off.
+# The law holds for the mean over many selections of splats; the worst layer is off by up to 1.63.
 assert np.max(np.abs(np.log(measured / law))) < np.log(1.63)

@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Figure 6: other materials
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 6, from the
+# Figure 6 of "Subsurface scattering using splat-based diffusion in point-based rendering", with the
 # built-in bust. `make figures` writes the picture; `docs/figures.md` describes it.
 
 # %%
@@ -27,7 +27,7 @@ from splatjax.plots import plot_pictures
 
 # %% [markdown]
 # The bust is scaled to 0.3 of its size, so that few splats resolve the diffusion of light in skin.
-# One light casts shadows, and a weak one does not.
+# One light casts shadows; a second, weak light does not.
 
 # %%
 body = sj.bust(40_000).scaled(0.3)
@@ -41,8 +41,8 @@ lights = (
 materials = {name: sj.load_material(name) for name in ("marble", "ketchup", "wholemilk")}
 
 # %% [markdown]
-# Skin has the color of the body's albedo map, the other materials have their own. Every picture has
-# its own exposure.
+# Skin takes its color from the albedo map of the body; the other materials have their own color.
+# Each picture has its own exposure.
 
 # %%
 plain = body.without_maps()
@@ -52,7 +52,7 @@ pictures = [frame.beauty / jnp.quantile(frame.beauty, 0.995) for frame in frames
 plot_pictures([pictures], ["skin", *materials], white=1.0, inches=3.0)
 
 # %% [markdown]
-# The numbers are the color of each material, red over blue, of its profile and of the picture.
+# The numbers are the ratio of red to blue of each material, in its profile and in the picture.
 
 # %%
 totals = [np.asarray(frame.diffuse).sum(axis=(0, 1)) for frame in frames[1:]]

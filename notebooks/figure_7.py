@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Figure 7: earlier point-based methods and this one
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 7, from the
+# Figure 7 of "Subsurface scattering using splat-based diffusion in point-based rendering", with the
 # built-in bust. `make figures` writes the picture; `docs/figures.md` describes it.
 
 # %%
@@ -27,7 +27,7 @@ from splatjax.plots import plot_pictures
 
 # %% [markdown]
 # The bust is scaled to 0.3 of its size, so that few splats resolve the diffusion of light in skin.
-# One light casts shadows, and a weak one does not.
+# One light casts shadows; a second, weak light does not.
 
 # %%
 body = sj.bust(40_000).scaled(0.3)
@@ -65,7 +65,8 @@ rows = [[frame.beauty for frame in line] for line in zip(*frames.values(), stric
 plot_pictures(rows, list(frames))
 
 # %% [markdown]
-# The numbers are the roughness of the light: the mean step from pixel to pixel inside the body.
+# The numbers measure the roughness of the light by the mean difference between neighboring pixels
+# inside the body.
 
 # %%
 roughness = {}

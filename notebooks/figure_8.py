@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Figure 8: half by texture-space diffusion, half by splats
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 8, from the
+# Figure 8 of "Subsurface scattering using splat-based diffusion in point-based rendering", with the
 # built-in bust. `make figures` writes the picture; `docs/figures.md` describes it, and shows how to
-# replace the bust by a mesh with texture coordinates.
+# use another mesh with texture coordinates.
 
 # %%
 # %matplotlib inline
@@ -31,8 +31,8 @@ from splatjax.io import srgb_to_linear
 from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# The head of the bust, scaled to 0.3 of its size. Its texture coordinates are longitude and
-# latitude, seen from inside; in them the ears overlap the head.
+# The body is the head of the bust, scaled to 0.3 of its size. Its texture coordinates are longitude
+# and latitude about a point inside, so the ears overlap the head in texture space.
 
 # %%
 SCALE, SIZE = 0.3, 256
@@ -50,12 +50,12 @@ lights = (
 skin = sj.load_material("skin").white()
 
 # %% [markdown]
-# The left half is rendered as triangles with texture-space diffusion, four samples a pixel, the
-# right half as splats. Beside it is the difference, splats less triangles, enlarged eight times
-# around middle gray.
+# The left half is rendered as triangles with texture-space diffusion and four samples per pixel,
+# the right half as splats. The picture beside it shows the difference, splats minus triangles,
+# amplified eight times around middle gray.
 
 # %%
-settings = sj.RenderSettings(kernel=sj.diffusion.PlainMean())  # that of texture space
+settings = sj.RenderSettings(kernel=sj.diffusion.PlainMean())  # as in texture space
 ours = sj.render(sj.Scene(splats, lights, skin), camera, settings)
 finer = replace(camera, width=2 * SIZE, height=2 * SIZE)
 theirs = baselines.render_texture_space(triangles, lights, skin, finer).frame

@@ -14,9 +14,9 @@
 # # Marble as a sum of Gaussians
 #
 # Light that enters marble leaves it some millimeters away. The profile $R(r)$, in 1/mm², is the
-# fraction that leaves at distance $r$, per area. The renderer represents it by a sum of Gaussians,
-# $R(r) \approx \sum_i w_i\, G(v_i, r)$, with one blurred layer for each. This notebook fits such a
-# sum.
+# fraction that leaves at the distance $r$, per area. The renderer represents the profile by a sum
+# of Gaussians, $R(r) \approx \sum_i w_i\, G(v_i, r)$, and renders one blurred layer per Gaussian.
+# This notebook fits such a sum.
 
 # %%
 # %matplotlib inline
@@ -27,9 +27,9 @@ import splatjax as sj
 from splatjax.plots import plot_fit
 
 # %% [markdown]
-# Jensen and others measured the coefficients in 2001. splatjax contains them, in 1/mm, with their
-# source. A `Dipole` computes a profile from them. In double precision the error is that of the fit,
-# not of rounding.
+# Jensen et al. measured the coefficients in 2001; splatjax contains them in 1/mm with their source.
+# A `Dipole` computes a profile from the coefficients. Double precision excludes rounding errors
+# from the error of the fit.
 
 # %%
 with jax.enable_x64(True):
@@ -47,9 +47,10 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# The error $E$ (Eq. 4 of the paper) depends little on the tail, and the unconstrained fit misses a
-# few per cent of the red energy there. Fixing the sum of the weights to the total reflectance keeps
-# the energy, for a slightly larger error. The materials of the library are fitted in this way.
+# The error $E$ (Eq. 4 of the paper) depends little on the tail, so the unconstrained fit misses a
+# few per cent of the red energy there. Fixing the sum of the weights to the total reflectance
+# conserves the energy, at a slightly larger error. The materials of the library are fitted in this
+# way.
 
 # %%
 print("total reflectance ", np.asarray(profile.total_reflectance()).round(4))
@@ -62,8 +63,8 @@ for name, fit in (("free", six), ("sum held", held)):
     )
 
 # %% [markdown]
-# GPU Gems 3 (chapter 14) published the fit of green marble with four Gaussians: variances .036,
-# .14, .91, 7.0 mm² and weights .070, .18, .21, .29. This fit gives the same numbers.
+# GPU Gems 3 (chapter 14) lists a fit of the green channel of marble with four Gaussians: variances
+# .036, .14, .91, 7.0 mm² and weights .070, .18, .21, .29. This fit gives the same numbers.
 
 # %%
 with jax.enable_x64(True):

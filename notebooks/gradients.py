@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Checking and viewing gradients
 #
-# A picture is a differentiable function of optical coefficients, of every splat, of lights and
-# camera. The first part checks the diffusion pass against finite differences. The second part shows
-# a derivative picture: the change of each pixel for a little more absorption.
+# A picture is a differentiable function of optical coefficients, splats, lights and camera. The
+# first part checks the derivatives of the diffusion pass against finite differences. The second
+# part shows a derivative picture, the change of each pixel with a little more absorption.
 
 # %%
 # %matplotlib inline
@@ -31,7 +31,7 @@ import splatjax as sj
 
 
 # %%
-# From coefficients (1/mm) to profile to Gaussians: the fit is differentiated implicitly.
+# From coefficients (1/mm) to the profile to Gaussians. The fit is differentiated implicitly.
 def gaussians_of(medium: sj.Medium) -> sj.SumOfGaussians:
     return sj.fit_gaussians(
         sj.Dipole(medium), 4, weights=sj.fitting.FixedTotalReflectance()
@@ -42,7 +42,7 @@ def scene_of(gaussians: sj.SumOfGaussians, count: int) -> sj.Scene:
     light = sj.DirectionalLight(jnp.asarray([-1.0, -0.25, -0.35]), jnp.full(3, np.pi))
     bare = eqx.tree_at(
         lambda splats: splats.albedo, sj.bust(count), None
-    )  # no map: the material alone has color
+    )  # without maps, the material determines the color
     return sj.Scene(bare, (light,), sj.Material(gaussians, eta=1.5, specular=0.0))
 
 
@@ -55,12 +55,12 @@ camera = sj.Camera.look_at(
 )
 
 # %% [markdown]
-# ## The diffusion pass, checked
+# ## A check of the diffusion pass
 #
-# `sj.diffuse_irradiance` is pass 4 alone: it computes one layer per Gaussian from the light below
-# the surface of every splat. In double precision, along a random direction of each input, its
-# reverse mode must agree with central differences. If splats move, the step must be so small that
-# no splat becomes visible or hidden: visibility has no derivative.
+# `sj.diffuse_irradiance` is pass 4 alone, which computes one layer per Gaussian from the light
+# below the surface of every splat. In double precision, along a random direction of each input,
+# reverse mode must agree with central differences. Visibility has no derivative, so the steps of
+# the splats must be small enough that no splat becomes visible or hidden.
 
 # %%
 with jax.enable_x64(True):
@@ -101,9 +101,10 @@ with jax.enable_x64(True):
 # %% [markdown]
 # ## A derivative picture
 #
-# `sj.picture_jacobian` renders a picture and computes the derivative of every pixel in every weight
-# and variance. It takes about twice as long as a frame, for any number of pixels. `through`
-# continues the derivative to the parameters of the Gaussians, here the coefficients of marble.
+# `sj.picture_jacobian` renders a picture and computes the derivative of every pixel with respect to
+# every weight and variance. It takes about twice as long as a frame, for any number of pixels.
+# `through` extends the derivative to the parameters of the Gaussians, here the coefficients of
+# marble.
 
 # %%
 with jax.enable_x64(True):
@@ -117,7 +118,7 @@ with jax.enable_x64(True):
 
 
 # %%
-# The change of the picture by 1% more of a coefficient, in all channels.
+# The change of the picture if a coefficient increases by 1%, in all channels.
 def change(name: str) -> np.ndarray:
     return np.asarray(
         getattr(by_coefficient, name) @ (0.01 * getattr(medium, name).astype(jnp.float32))
@@ -141,10 +142,10 @@ figure  # noqa: B018
 
 # %% [markdown]
 # More absorption darkens all pixels. The relative loss is greatest where light has traveled far,
-# beyond the edge of the shadow. With more scattering light returns sooner: lit parts become
-# brighter, and shadows darker.
+# beyond the edge of the shadow. With more scattering, light returns sooner, so lit parts become
+# brighter and shadows darker.
 #
-# Finite differences need a fit and a frame on each side, for every coefficient:
+# Finite differences need two fits and two frames for every coefficient:
 
 # %%
 pictures = []
@@ -156,7 +157,7 @@ for factor in (1.01, 0.99):
     pictures.append(np.asarray(sj.render(end, camera, plan=plan).beauty))
 difference = (pictures[0] - pictures[1]) / 2
 error = np.linalg.norm(change("sigma_a") - difference) / np.linalg.norm(difference)
-print(f"derivative picture against finite differences: {error:.1e} of its norm")
+print(f"derivative picture minus finite differences: {error:.1e} of its norm")
 
 # %%
 assert max(errors.values()) < 1e-5

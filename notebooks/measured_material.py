@@ -13,9 +13,9 @@
 # %% [markdown]
 # # A material from a measurement
 #
-# A measured profile $R(r)$ is a table of radii and values. A photograph of a laser dot, linear and
-# from straight above, also gives one: the profile is the mean over rings around the center of the
-# dot, and the scatter in the rings gives its error.
+# A measured profile $R(r)$ is a table of radii and values. A linear photograph of a laser dot from
+# straight above also gives a profile: its values are means over rings around the center of the dot,
+# and the variation within the rings gives the errors.
 
 # %%
 # %matplotlib inline
@@ -31,9 +31,9 @@ import splatjax as sj
 from splatjax.plots import plot_fit
 
 # %% [markdown]
-# This is a synthetic photograph of a material like potato, with the noise of a camera. The beam has
-# a variance of 0.25 mm² along each axis, so the photograph shows the profile blurred by the beam:
-# the variances add.
+# This is a synthetic photograph of a material like potato, with camera noise. The beam has a
+# variance of 0.25 mm² along each axis. The photograph shows the profile blurred by the beam, so
+# their variances add.
 
 # %%
 with jax.enable_x64(True):
@@ -51,9 +51,9 @@ axes.imshow(np.log10(np.maximum(photograph[..., 0], 1e-4)), cmap="magma", extent
 figure  # noqa: B018
 
 # %% [markdown]
-# `fit_medium` finds the absorption and scattering. It computes Gaussians from coefficients, and the
-# blurred profile from the Gaussians, and minimizes the residual along its derivatives. The error
-# bars follow from the scatter of the pixels.
+# `fit_medium` fits the absorption and scattering. It computes Gaussians from coefficients and the
+# blurred profile from the Gaussians, and minimizes the residual by its derivatives. The error bars
+# are computed from the variation of the pixels.
 
 # %%
 with jax.enable_x64(True):
@@ -68,8 +68,9 @@ for name, value, bar in zip(("sigma_a ", "sigma_s'"), values, bars, strict=True)
 print(f"chi squared per degree of freedom {chi_squared:.2f}")
 
 # %% [markdown]
-# Without a model, the table itself can be fitted, over its own radii only. As a CSV file of radii
-# and a column for each channel, `splatjax fit potato.csv --output potato.toml` fits it.
+# Without a model, Gaussians can be fitted to the table itself, over its own radii only.
+# `splatjax fit potato.csv --output potato.toml` does this for a CSV file with a column of radii and
+# a column per channel.
 
 # %%
 with jax.enable_x64(True):
@@ -82,7 +83,7 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# For other renderers, export the same material as JSON, with the formula and the source of each
+# For other renderers, the material is exported as JSON, with the formula and the source of each
 # number.
 
 # %%

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # A new material from coefficients, or from layers
 #
-# A material needs the absorption coefficient $\sigma_a$ and the reduced scattering coefficient
-# $\sigma_s'$ of each channel, in 1/mm, and the index of refraction. This notebook fits a jade-like
-# stone, and the same stone under a thin red glaze.
+# A material is defined by the absorption coefficient $\sigma_a$ and the reduced scattering
+# coefficient $\sigma_s'$ of each channel, in 1/mm, and the index of refraction. This notebook fits
+# a jade-like stone, and the same stone under a thin red glaze.
 
 # %%
 # %matplotlib inline
@@ -40,12 +40,12 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# Each further Gaussian divides the error by two to three, and costs one more layer. Choose the
-# least number that reaches a required error in every channel, here 0.02. (`fit_gaussians(profile,
-# LeastCount(0.02))` does this in one call.) The sum of the weights is fixed to the total
-# reflectance, which keeps the energy of the picture. (If the channels differ more, some weights
-# become slightly negative; `NonNegativeWeights(FixedTotalReflectance())` prevents it, as in the
-# materials of the library.)
+# Each additional Gaussian divides the error by two to three and costs one more layer. The next cell
+# selects the least number that reaches an error of 0.02 in every channel.
+# (`fit_gaussians(profile, LeastCount(0.02))` does this in one call.) The sum of the weights is
+# fixed to the total reflectance, which conserves the energy of the picture. (If the channels differ
+# more, some weights become slightly negative; `NonNegativeWeights(FixedTotalReflectance())`
+# prevents this, as for the materials of the library.)
 
 # %%
 with jax.enable_x64(True):
@@ -56,8 +56,8 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# `covariance` describes how well the fit is determined. It contains the variances, then the weights
-# of red, green and blue. Within its ellipsoid the error of Eq. 3 at most doubles: a relative
+# `covariance` describes how well the fit determines the parameters: the variances, then the weights
+# of red, green and blue. Within its ellipsoid the error of Eq. 3 at most doubles, so a relative
 # deviation above 1 would mean that a Gaussian can be omitted.
 
 # %%
@@ -65,9 +65,9 @@ print("variances (mm²)", variances.round(4))
 print("  known to     ", (np.sqrt(np.diag(covariance))[:count] / variances).round(3))
 
 # %% [markdown]
-# A glaze of half a millimeter changes the core of the profile and hardly its tail, because light
+# A glaze of half a millimeter changes the core of the profile but hardly its tail, because light
 # that travels far travels below the glaze. A scattering layer must be thicker than a mean free
-# path, here $1 / (4 + 0.3)$ mm; thinner ones raise an error.
+# path, here $1 / (4 + 0.3)$ mm; thinner layers raise an error.
 
 # %%
 with jax.enable_x64(True):
@@ -80,8 +80,8 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# A material consists of these Gaussians and a surface. `save_material` writes it with its layers,
-# unit and source as a TOML file, which `splatjax render --material glazed.toml` and `load_material`
+# A material consists of these Gaussians and a surface. `save_material` writes it with layers, unit
+# and source to a TOML file, which `splatjax render --material glazed.toml` and `load_material`
 # read.
 
 # %%

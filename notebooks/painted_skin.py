@@ -13,18 +13,18 @@
 # %% [markdown]
 # # Painted skin, from pictures under three lights
 #
-# A figurine the size of a fingertip has the optical coefficients of skin, and bands of paint. Its
-# shape, the camera and the lights are known, and there is no paint below its chin. The coefficients
-# and the paint are unknown.
+# A figurine the size of a fingertip has the optical coefficients of skin, and bands of paint above
+# its chin. Its shape, the camera and the lights are known. The coefficients and the paint are
+# unknown.
 #
-# A picture determines only the product of the albedo map and the reflectance of the coefficients,
-# so one factor must be known: here the map is 1 where the skin is bare. `recover` finds the
-# coefficients from the pixels there, with error bars. Then `fit_scene` fits the albedo of every
-# splat along the gradient of the renderer. The two fits are separate: least squares finds six
-# coefficients in a few cheap steps, because it uses their correlations, and a first-order method
-# would need many steps with thousands of albedos. Paint near the border takes light from bare skin,
-# which changes the coefficients by a per cent. To remove this error, alternate both fits, starting
-# from the fitted paint.
+# A picture only determines the product of the albedo map and the reflectance of the coefficients,
+# so one factor must be known; here the map is 1 where the skin is bare. `recover` fits the
+# coefficients to the pixels of bare skin, with error bars. Then `fit_scene` fits the albedo of
+# every splat by gradients of the renderer. The two fits are separate, because least squares finds
+# six coefficients in a few cheap steps by using their correlations, whereas a first-order method
+# would need many steps together with thousands of albedos. Paint near the border absorbs light from
+# bare skin, which changes the coefficients by a per cent. To remove this error, alternate the two
+# fits, starting from the fitted paint.
 
 # %%
 # %matplotlib inline
@@ -42,7 +42,7 @@ from splatjax.splatting import DenseRasterizer
 
 SPLATS, SIZE, COUNT, STEPS, NOISE = 700, 30, 3, 30, 0.01
 HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
-# Every splat at every pixel: for small pictures. Leave `settings` out for large ones.
+# Evaluate every splat at every pixel, for small pictures. Omit `settings` for large pictures.
 settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 
 figurine = sj.bust(SPLATS).scaled(1 / 16)
@@ -86,7 +86,7 @@ bare = np.asarray(frames[0].position)[..., 1] < border - 0.3
 # %% [markdown]
 # ## First the skin, then the paint
 #
-# The start is coefficients with an error of a factor of two, and a uniform gray paint.
+# The fits start from coefficients that are off by a factor of two, and from uniform gray paint.
 
 
 # %%
@@ -142,8 +142,8 @@ plot_pictures(
 )
 
 # %% [markdown]
-# The photographs are soft where light has spread; the map is sharp. Splats that no picture shows,
-# at the back, keep their initial albedo.
+# The photographs are soft where light has spread, but the map is sharp. Splats at the back, which
+# no picture shows, keep their initial albedo.
 
 # %%
 assert np.max(np.abs(off)) < 0.05

@@ -13,12 +13,12 @@
 # %% [markdown]
 # # Marble from one photograph
 #
-# A lamp lights a figurine of marble, three centimeters tall, from the side. Its shape, the
-# positions of camera and lamp, and the strength of the lamp are known. The absorption and the
-# scattering of the stone, and their errors, are to be found from one photograph.
+# A lamp lights a marble figurine, three centimeters tall, from the side. Its shape, the positions
+# of camera and lamp, and the strength of the lamp are known. This notebook recovers the absorption
+# and the scattering of the stone, with error bars, from one photograph.
 #
-# The photograph is rendered from the coefficients that Jensen and others measured in 2001, so that
-# the true values are known. Noise of 1% is added.
+# The photograph is rendered from the coefficients that Jensen et al. measured in 2001, so the true
+# values are known. Noise of 1% is added.
 
 # %%
 # %matplotlib inline
@@ -34,15 +34,15 @@ from splatjax.splatting import DenseRasterizer, ShadowSettings
 SIZE, COUNT, NOISE = 40, 4, 0.01
 DIPOLE = sj.fitting.DiffusionModel()
 HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
-# Every splat at every pixel, and coarse shadows: for small pictures. Leave `settings` out for large
-# ones.
+# Evaluate every splat at every pixel, with coarse shadows, for small pictures. Omit `settings` for
+# large pictures.
 shadows = ShadowSettings(resolution=48, bias=0.35, softness=0.7)
 settings = sj.RenderSettings(
     shadows=shadows, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
 )
 
 
-# The bust, eight times smaller, without its albedo: only the coefficients give the color.
+# The bust, eight times smaller and without albedo, so that the coefficients determine the color.
 def figurine(count: int) -> sj.Splats:
     bust = sj.bust(count)
     return sj.Splats(bust.centers / 8, bust.normals, bust.radii / 8, bust.areas / 64)
@@ -66,10 +66,10 @@ with jax.enable_x64(True):
 # %% [markdown]
 # ## The coefficients
 #
-# The search starts from skin, which absorbs some tens of times more. It finds the logarithms of
-# both coefficients of red, green and blue by least squares on all pixels at once. The part of a
-# picture that does not depend on the weights of its layers is rendered once, so a step evaluates no
-# splats.
+# The search starts from skin, whose absorption is some tens of times larger. It fits the logarithms
+# of both coefficients of red, green and blue to all pixels at once by least squares. The part of a
+# picture that does not depend on the weights of its layers is rendered once, so the steps do not
+# evaluate splats.
 
 # %%
 with jax.enable_x64(True):
@@ -103,9 +103,10 @@ for name, bars in zip(("sigma_a", "sigma_s_prime"), found.relative_errors(), str
 # %% [markdown]
 # ## Which picture to take next
 #
-# A picture determines the amount of returning light best, and its distance worse: one combination
-# of the coefficients is known much better than the other. Each of these pictures, rendered with the
-# recovered material, would add information; the inverse of the sum is the predicted covariance.
+# A picture determines the amount of returning light better than the distance that it travels, so
+# one combination of the coefficients is known much better than the other. Each candidate picture,
+# rendered with the recovered material, would add information; the inverse of the total information
+# is the predicted covariance.
 
 # %%
 best, worst = found.combinations()[0]

@@ -14,8 +14,9 @@
 # # New light on a rendered view
 #
 # A picture is linear in its light. This notebook renders a bust once under each of 25 spherical
-# harmonics. Its picture under any smooth environment is then a sum, which takes milliseconds. The
-# inverse problem finds the environment from one photograph of a known body.
+# harmonics. The picture under any smooth environment is then a sum, which takes milliseconds. The
+# notebook also solves the inverse problem: it recovers the environment from one photograph of a
+# known body.
 
 # %%
 # %matplotlib inline
@@ -30,9 +31,9 @@ splats, material = sj.bust(12_000), sj.load_material("skin").white()
 camera = sj.Camera.look_at((60, -20, 620), (0, -40, 0), fov=30, width=128, height=128)
 
 # %% [markdown]
-# ## Under a turning environment
+# ## A rotating environment
 #
-# The coefficients of the light are zero here, because the basis is rendered for all of them. Light
+# The coefficients of the light are zero here, because the basis does not depend on them. Light
 # comes from 64 directions, whose shadow maps are rendered once.
 
 # %%
@@ -53,8 +54,8 @@ figure  # noqa: B018
 # %% [markdown]
 # ## The environment of a photograph
 #
-# The renderer makes two photographs with noise of 1%: one under a soft studio of nine harmonics,
-# one under the full studio, which has many.
+# Two photographs are rendered with noise of 1%: one under a soft studio of nine harmonics, and one
+# under the full studio, which has many more.
 
 # %%
 whole = sj.EnvironmentLight(sj.scene.studio(), 60, directions=even_directions(64))
@@ -74,9 +75,9 @@ noisy = {
 }
 
 # %% [markdown]
-# The coefficients of each channel follow by linear least squares from all pixels. The residual
-# gives the noise and the error bars. There are nine unknowns for the soft studio, and 25 for the
-# full one, of which the first nine are shown.
+# The coefficients of each channel are fitted to all pixels by linear least squares. The residual
+# gives the noise and the error bars. The soft studio has nine unknowns; the full studio has 25, of
+# which the first nine are shown.
 
 
 # %%
@@ -112,9 +113,9 @@ for (name, (ours, bars, left)), picture, plot in zip(
 figure  # noqa: B018
 
 # %% [markdown]
-# For the soft studio the true values are within the error bars. The full studio has light that a
-# sum of 25 harmonics cannot represent. Its residual is larger than the noise, which indicates that
-# the error bars are too small; the nine coefficients are still right to some percent.
+# For the soft studio, the true values are within the error bars. The full studio contains light
+# that a sum of 25 harmonics cannot represent. Its residual exceeds the noise, which indicates that
+# the error bars are too small, but the nine coefficients are still accurate to some per cent.
 
 # %%
 assert np.max(np.abs(found["soft"][0] - true) / found["soft"][1]) < 4

@@ -13,12 +13,12 @@
 # %% [markdown]
 # # Bumps recovered from shading
 #
-# A ball of two centimeters has bumps and dents of half a millimeter and more. Given are the smooth
-# ball, and pictures of the true one under three lights, with noise of 1%. Each splat may move along
-# its normal, and its normal follows from the offsets of its neighbors. Light that spreads below the
-# surface fills the dark side of each bump, so shading contains less information. The notebook
-# compares a material in which light hardly spreads with one in which it spreads over the width of
-# the bumps.
+# A ball of two centimeters has bumps and dents of half a millimeter and more. The fit starts from a
+# smooth ball, and uses pictures of the true ball under three lights, with noise of 1%. Each splat
+# may move along its normal, and the normals follow the displaced surface. Light that spreads below
+# the surface fills the dark side of each bump, so shading contains less information. The notebook
+# compares a material in which light hardly spreads with one in which light spreads over the width
+# of the bumps.
 
 # %%
 # %matplotlib inline
@@ -32,11 +32,11 @@ from splatjax.plots import plot_pictures
 from splatjax.splatting import DenseRasterizer
 
 SPLATS, SIZE, STEPS, NOISE, RADIUS = 900, 30, 24, 0.01, 10.0
-# Every splat at every pixel: for small pictures. Leave `settings` out for large ones.
+# Evaluate every splat at every pixel, for small pictures. Omit `settings` for large pictures.
 settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 
 
-# Directions, evenly.
+# Evenly spread directions.
 def spread(count: int) -> np.ndarray:
     i = np.arange(count) + 0.5
     z, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
@@ -70,7 +70,7 @@ lamps = [
     sj.DirectionalLight(jnp.asarray(way), jnp.full(3, np.pi), cast_shadows=False)
     for way in directions
 ]
-# No blur: the heights themselves.
+# Use the heights without blur.
 as_given = sj.inverse.NormalOffsets(step=1.0, smoothness=1e-3, deviation=1.0)
 bumpy = as_given.moved(
     sj.inverse.PicturedScene(smooth, camera, tuple(lamps)),
@@ -80,7 +80,7 @@ bumpy = as_given.moved(
 weights = jnp.asarray([[0.35, 0.35, 0.4], [0.3, 0.25, 0.2], [0.2, 0.15, 0.1]])
 
 
-# Factors on the widths of 0.5, 1.2 and 2.8 mm by which light spreads.
+# `wider` scales the widths over which light spreads, 0.5, 1.2 and 2.8 mm.
 def material(wider: float) -> sj.Material:
     return sj.Material(
         sj.SumOfGaussians(wider**2 * jnp.asarray([0.3, 1.5, 8.0]), weights), eta=1.5, specular=0.0
@@ -88,10 +88,10 @@ def material(wider: float) -> sj.Material:
 
 
 # %% [markdown]
-# ## Fit along the gradient
+# ## Fit by gradients
 #
 # Offsets are blurred over 1 mm, about the spacing of the splats, so finer bumps are not recovered.
-# Outlines are not used, since only pixels that the body fills count.
+# Outlines are not used, because only pixels that the body fills count.
 
 
 # %%

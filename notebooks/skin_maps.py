@@ -13,12 +13,13 @@
 # %% [markdown]
 # # Melanin and blood of a face, from pictures
 #
-# The color of skin has two causes: melanin in the epidermis and blood in the dermis. This notebook
-# tabulates the Gaussians of skin as a function of both, renders skin types from light to dark, and
-# a face with freckles and a blush. Then it recovers the maps of melanin and blood from three
-# pictures of that face, with error bars for every splat.
+# The color of skin has two main causes: melanin in the epidermis and blood in the dermis. This
+# notebook tabulates the Gaussians of skin as a function of both, and renders skin types from light
+# to dark and a face with freckles and a blush. Then it recovers the maps of melanin and blood from
+# three pictures of the face, with error bars for every splat.
 #
-# The face is a figurine, so that few splats resolve the distance that light travels in skin.
+# The face has the size of a figurine, so that few splats resolve the distance that light travels in
+# skin.
 
 # %%
 # %matplotlib inline
@@ -36,9 +37,9 @@ from splatjax.diffusion import DenseDiffuser
 from splatjax.plots import plot_pictures
 from splatjax.splatting import DenseRasterizer
 
-# Every splat at every pixel: for small pictures. Leave `settings` out for large ones.
+# Evaluate every splat at every pixel, for small pictures. Omit `settings` for large pictures.
 settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
-WAVELENGTHS = (620, 550, 460)  # nm; in place of red, green and blue
+WAVELENGTHS = (620, 550, 460)  # nm, instead of red, green and blue
 VARIANCES = [0.03, 0.25, 2.0, 14.0]
 
 
@@ -50,8 +51,8 @@ def skin(melanin, blood, oxygenation=0.75):
 # %% [markdown]
 # ## A table of skins
 #
-# The base is the lightest skin: its profile is the widest. Each node of the table is one fit of
-# weights, and splines interpolate between nodes.
+# The base is the lightest skin, because its profile is the widest. Each node of the table is one
+# fit of weights; splines interpolate between nodes.
 
 # %%
 nodes = {"melanin": np.geomspace(0.01, 0.4, 7), "blood": np.geomspace(0.002, 0.08, 5)}
@@ -71,8 +72,8 @@ print("reflectance between nodes:", tabulated.round(4), "of the model:", exact.r
 # %% [markdown]
 # ## Skin types, and a blush
 #
-# Upper row: more and more melanin. Lower row: three times as much blood, with more oxygen, which a
-# second table would interpolate as well; here each skin is one fit.
+# In the upper row, melanin increases to the right. The lower row has three times as much blood,
+# with more oxygen. Each skin is one fit; a second table could interpolate oxygenation too.
 
 # %%
 bust = sj.bust(2500).scaled(1 / 8).without_maps()
@@ -97,9 +98,9 @@ plot_pictures(
 # %% [markdown]
 # ## A face with freckles and a blush
 #
-# Three pictures under three lights, with noise of 1%. The fit starts from even skin. A picture
-# determines the product of an albedo and the reflectance of the skin, so the figurine has no
-# albedo.
+# The three pictures have three different lights and noise of 1%. The fit starts from uniform skin.
+# The figurine has no albedo, because a picture only determines the product of an albedo and the
+# reflectance of the skin.
 
 # %%
 SPLATS, SIZE, NOISE = 800, 36, 0.01
@@ -134,9 +135,9 @@ for lamp in lamps:
 # %% [markdown]
 # ## Fit, and repeat with perturbed pictures
 #
-# Adam comes near, and L-BFGS goes on. Fits of perturbed pictures give error bars, of noise and
-# prior. Neither fit has converged completely, so that the bars are somewhat too small; more steps
-# remove this error.
+# Adam approaches the optimum, and L-BFGS refines the result. Fits of perturbed pictures give error
+# bars that include noise and prior. The fits have not converged completely, so the error bars are
+# somewhat too small; more steps remove this error.
 
 # %%
 start = {"melanin": 0.035, "blood": 0.012}
@@ -188,8 +189,8 @@ plot_pictures(
 )
 
 # %% [markdown]
-# Melanin darkens all colors and blood mainly green, so three colors separate both. Where little
-# light arrives, bars are wide, and the maps keep their start.
+# Melanin darkens all colors, and blood mainly green, so three colors separate the two. Where little
+# light arrives, the error bars are wide and the maps keep their initial values.
 
 # %%
 assert np.all(np.abs(tabulated / exact - 1) < 1e-3)

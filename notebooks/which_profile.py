@@ -13,10 +13,10 @@
 # %% [markdown]
 # # Which profile for which material
 #
-# Every model below computes a profile from the same coefficients. The models differ near the
-# source, where diffusion is a poor approximation, and agree at large distances. The dots are the
-# reference, `sj.transport.monte_carlo`, with standard errors. Radii are in mean free paths, $r
-# \sigma_t'$. [Which profile when](../docs/which_profile.md) has the numbers for many media.
+# All models below compute a profile from the same coefficients. They differ near the source, where
+# diffusion is a poor approximation, and agree at large distances. The dots are the reference,
+# `sj.transport.monte_carlo`, with standard errors. Radii are in mean free paths, $r \sigma_t'$.
+# [Which profile when](../docs/which_profile.md) has the numbers for many media.
 
 # %%
 # %matplotlib inline
@@ -41,7 +41,7 @@ models = {
 
 
 def burley(medium: sj.Medium) -> sj.scattering.Burley:
-    """With the albedo that the photon beam has; its length is the mean free path."""
+    """Make normalized diffusion with the albedo of the photon beam and the mean free path."""
     albedo = sj.scattering.PhotonBeam(medium).total_reflectance()
     return sj.scattering.Burley(albedo, 1 / (medium.sigma_a + medium.sigma_s_prime))
 
@@ -81,20 +81,20 @@ figure  # noqa: B018
 
 # %% [markdown]
 # - **Dipole** (Jensen 2001): the model of most published fits and coefficients. It has too much
-#   light between one and two mean free paths, and too little in the tail at strong absorption. Use
+#   light between one and two mean free paths, and too little in the tail for strong absorption. Use
 #   it to compare with the literature.
-# - **BetterDipole** (d'Eon 2012): the same cost, the best totals, and an error of some ten per cent
-#   beyond one mean free path at weak absorption.
-# - **PhotonBeam** (Habel 2013): adds single scattering, which diverges like $1/r$ at the origin.
-#   Beyond one mean free path its error for marble is a few per cent. Use it, with a cut, when in
-#   doubt.
-# - **Burley** (Christensen 2015): a curve fitted to Monte Carlo, with a color and one length as
-#   parameters. Film renderers exchange these. It does not include the index of refraction: for
+# - **BetterDipole** (d'Eon 2012): the same cost, the best totals, and errors of about ten per cent
+#   beyond one mean free path for weak absorption.
+# - **PhotonBeam** (Habel 2013): includes single scattering, which diverges like $1/r$ at the
+#   origin. Beyond one mean free path its error for marble is a few per cent. If in doubt, use it
+#   with a cut.
+# - **Burley** (Christensen 2015): a curve fitted to Monte Carlo, with a color and a length as
+#   parameters, as in many film renderers. It does not include the index of refraction, so for
 #   marble, whose surface reflects much of the light back inside, it decays too early.
-# - **Multipole** and **LayeredMultipole** (Donner 2005): slabs and layers, for skin, leaves and
-#   paper; four mean free paths thick and more.
+# - **Multipole** and **LayeredMultipole** (Donner 2005): slabs and layers at least four mean free
+#   paths thick, for skin, leaves and paper.
 #
-# The total reflectances differ as well.
+# The total reflectances differ too.
 
 # %%
 for name in media:
@@ -107,9 +107,9 @@ for name in media:
     )
 
 # %% [markdown]
-# Profiles with a $1/r$ core have no integral of $r R^2$ at the origin. Their Gaussians are fitted
-# beyond a cut, given in length scales of the profile; the narrowest Gaussians of a material
-# represent the part within.
+# For profiles with a $1/r$ core, the integral of $r R^2$ diverges at the origin. Their Gaussians
+# are fitted beyond a cut, given in length scales of the profile; the narrowest Gaussians represent
+# the part inside the cut.
 
 # %%
 with jax.enable_x64(True):
@@ -119,8 +119,8 @@ with jax.enable_x64(True):
 print("E beyond one mean free path", round(error, 4))
 
 # %% [markdown]
-# The reference itself can be fitted, weighted by its errors, with the sum of the weights fixed to
-# the true total.
+# Gaussians can also be fitted to the reference itself, weighted by its errors, with the sum of the
+# weights fixed to the true total.
 
 # %%
 photons = truth["marble, green"]

@@ -1,8 +1,7 @@
 """splatjax: a differentiable renderer for translucent materials.
 
-It computes pictures of translucent bodies from optical coefficients, and coefficients from
-pictures. All lengths are in millimeters. The most used names are here; the others are in
-submodules:
+It renders translucent bodies from optical coefficients, and recovers coefficients from pictures.
+All lengths are in millimeters. The most common names are here; the others are in submodules:
 
 - `scattering`: media, slabs and their profiles; `transport`: the Monte Carlo reference.
 - `fitting`: fits of sums of Gaussians; `gaussians`: profiles and sums of Gaussians.
@@ -10,7 +9,7 @@ submodules:
 - `scene`: cameras, lights, materials and frames; `geometry`: bodies.
 - `io`: files; `exports`: materials for other renderers.
 - `splatting`, `diffusion`, `shading`: the passes, and their settings.
-- `cache`: keeps results and compiled pictures for the next start of a program.
+- `cache`: stores results and compiled programs for the next start.
 
 `splatjax.baselines` (methods to compare with), `splatjax.plots` (which needs matplotlib) and
 `splatjax.studio` (a scene that changes live) must be imported explicitly.

@@ -1,5 +1,5 @@
-"""Compute functions of many points chunk by chunk, and many steps as one program; and the planned
-capacities of arrays whose shapes are static.
+"""Evaluation of pointwise functions in chunks, compilation of functions as one program, and planned
+capacities of arrays with static shapes.
 """
 
 import functools
@@ -18,7 +18,7 @@ Result = TypeVar("Result", bound=PyTree)
 
 AT_ONCE = 1 << 16
 _LEAST_SPARE = 1.1
-_LONGEST_DOUBLED = 1 << 19  # here both ways take as long to run
+_LONGEST_DOUBLED = 1 << 19  # both methods take equally long at this length
 
 
 def map_chunks(
@@ -29,18 +29,18 @@ def map_chunks(
 ) -> Result:
     r"""Apply a pointwise function to chunks of arrays, one after the other, and join the results.
 
-    Arrays of at most one chunk are computed directly. For longer ones, no intermediate array is
-    larger than a chunk, and the derivative recomputes the intermediates. The results are
-    materialized: a compiler that fuses would otherwise compute them again for every reader.
+    Arrays of at most one chunk are computed directly. For longer arrays, no intermediate is larger
+    than a chunk, and the derivative recomputes the intermediates. The results are materialized;
+    otherwise a fusing compiler would recompute them for every use.
 
     **Arguments:**
 
-    - `function`: pointwise: element i of each result depends only on element i of the arrays and
-      on what the function closes over.
-    - `arrays`: trees of arrays, all of one length. Differentiable as the function is.
+    - `function`: pointwise: element i of each result depends only on element i of the arrays and on
+      variables that the function closes over.
+    - `arrays`: trees of arrays of equal length. Differentiable as `function` is.
     - `at_once`: the largest length of a chunk.
-    - `used`: the elements whose results are used. Of several chunks, those without any are not
-      computed, and their results are 0. All for `None`.
+    - `used`: the elements whose results are used; all for `None`. If there are several chunks, a
+      chunk without used elements is not computed, and its results are 0.
 
     **Returns:** `function(*arrays)`.
     """
@@ -83,11 +83,11 @@ def map_chunks(
     )
 
 
-_LONGEST = 4  # of the vectors that are kept as planes
+_LONGEST = 4  # components of the vectors that are stored as planes
 
 
 class _Planes(eqx.Module):
-    """The components of vectors as separate arrays. A loop reads and writes whole planes; it would
+    """The components of vectors as separate arrays: loops read and write whole planes, but would
     fetch interleaved components one at a time.
     """
 
@@ -111,9 +111,7 @@ def _vectors(tree: PyTree) -> PyTree:
 def take_rows(
     array: Shaped[Array, "points ..."], chosen: Int[Array, " chosen"]
 ) -> Shaped[Array, "chosen ..."]:
-    """Take points, in ascending order, along the first axis; 0 for indices from the number of
-    points on.
-    """
+    """Take points along the first axis at ascending indices; indices past the end give 0."""
     if len(array) == 0:
         return jnp.zeros((len(chosen), *array.shape[1:]), array.dtype)
     return array.at[chosen].get(mode="fill", fill_value=0, indices_are_sorted=True)
@@ -122,12 +120,12 @@ def take_rows(
 def take_points(
     rows: Shaped[Array, "*rows points"], chosen: Int[Array, " chosen"] | None
 ) -> Shaped[Array, "*rows chosen"]:
-    """Take points likewise, along the last axis; all for `None`."""
+    """Take points along the last axis at ascending indices; `None` takes all."""
     if chosen is None:
         return rows
     if rows.size == 0:
         return jnp.zeros((*rows.shape[:-1], len(chosen)), rows.dtype)
-    # Row by row, so that derivatives are planes too, put together once: that of slices is a sum.
+    # Row by row: the derivative then concatenates planes once, whereas that of slices adds arrays.
     count = rows.shape[-1]
     planes = jax.lax.split(rows.reshape(-1, count), [1] * (rows.size // count))
     taken = jnp.stack([take_rows(plane[0], chosen) for plane in planes])
@@ -152,11 +150,10 @@ def split_rows(stacked: Float[Array, "all points"], like: PyTree) -> PyTree:
 def running(
     combine: Callable[[Array, Array], Array], values: Int[Array, "*rows n"]
 ) -> Int[Array, "*rows n"]:
-    """Combine every number with all before it, along the last axis: sums, or maxima of what is not
-    negative.
+    """Compute running sums, or running maxima of non-negative numbers, along the last axis.
 
-    XLA's own cumulative sum is a program of a dozen kernels, and to compile it takes three times as
-    long. It adds fewer numbers, so that it is used for long arrays.
+    XLA's own cumulative sum has a dozen kernels and takes three times as long to compile. It needs
+    fewer additions, so it is used for long arrays.
     """
     length = values.shape[-1]
     if length > _LONGEST_DOUBLED and combine is jnp.add:
@@ -173,16 +170,16 @@ def running(
 
 
 def divided(numbers: Int[Array, "*shape"], by: int) -> tuple[Int[Array, "*shape"], ...]:
-    """Divide numbers that are not negative: quotients and remainders. `divmod` has ten instructions
-    more, for negative numbers.
+    """Compute quotients and remainders of non-negative numbers. `divmod` has ten more instructions,
+    for negative numbers.
     """
     quotients = jax.lax.div(numbers, jnp.full_like(numbers, by))
     return quotients, numbers - quotients * by
 
 
 def list_chosen(chosen: Bool[Array, " all"], capacity: int) -> Int[Array, " capacity"]:
-    """List the indices of the chosen, in order, as many as there is capacity for; the number of all
-    in empty places.
+    """List the ascending indices of chosen elements, up to a capacity. Unused entries are
+    `len(chosen)`.
     """
     places = jnp.where(chosen, running(jnp.add, chosen.astype(jnp.int32)) - 1, capacity)
     every = jnp.arange(len(chosen), dtype=jnp.int32)
@@ -190,8 +187,8 @@ def list_chosen(chosen: Bool[Array, " all"], capacity: int) -> Int[Array, " capa
 
 
 def rounded_up(count: int, step: int, per_octave: int = 8) -> int:
-    """Round up to the next of so many steps per octave, a power of 2, and to a multiple of `step`,
-    so that nearby counts need no other program.
+    """Round up to a multiple of `step` and of `per_octave` (a power of 2) steps per octave, so that
+    nearby counts share a program.
     """
     grain = max(1 << max(count.bit_length() - per_octave.bit_length(), 0), step)
     return -(-count // grain) * grain
@@ -200,13 +197,13 @@ def rounded_up(count: int, step: int, per_octave: int = 8) -> int:
 def with_spare(
     kind: Hashable, count: int, step: int, per_octave: int = 8, spare: float = 1.03, cheap: int = 0
 ) -> int:
-    """Plan the capacity of a kind of array for a count: `spare` times as many and at least one
-    more, rounded up; or one planned before that has at least 10% to spare, or as much as that.
+    """Plan the capacity of a kind of array for a count: `spare` times the count, at least one more,
+    rounded up. An earlier capacity with that margin, or with 10%, is reused.
 
     **Arguments:**
 
-    - `cheap`: a capacity that takes hardly any time. Up to it, twice the count is planned, and all
-      that was planned is reused, so that other bodies in small pictures need no other program.
+    - `cheap`: a capacity that costs hardly any time. Up to it, twice the count is planned and every
+      earlier capacity is reused, so that other bodies in small pictures share a program.
     """
     planned = max(int(count * spare), min(2 * count, cheap)) + 1
     capacity = rounded_up(planned, step, per_octave)
@@ -216,8 +213,8 @@ def with_spare(
 
 
 def needed_over_planned(needed: Int[Array, ""], planned: int) -> Float[Array, ""]:
-    """Compute the capacity needed over planned: above 1 if and only if more is needed, which the
-    rounding of a quotient hides from 16.7 million on.
+    """Divide the needed by the planned capacity. The ratio exceeds 1 if and only if more is needed,
+    even above 16.7 million, where a plain quotient would round to 1.
     """
     ratio = needed.astype(jnp.float32) / planned
     return jnp.where(needed > planned, jnp.maximum(ratio, 1 + jnp.finfo(ratio.dtype).eps), ratio)
@@ -225,8 +222,8 @@ def needed_over_planned(needed: Int[Array, ""], planned: int) -> Float[Array, ""
 
 @jax.custom_jvp
 def materialized(tree: PyTree[Array]) -> PyTree[Array]:
-    """Return arrays as they are, computed once and for all: a compiler cannot fuse what computes
-    them into their readers, which might compute it again, one number at a time, or on one thread.
+    """Return arrays unchanged, computed only once: the compiler cannot fuse their computation into
+    their uses, where it might be repeated, done one number at a time, or run on one thread.
     """
     never = _hidden_zero(tree)
     return jax.lax.fori_loop(0, never, lambda _, kept: jax.tree.map(jnp.flip, kept), tree)
@@ -238,31 +235,31 @@ def _materialized_jvp(primals, tangents):
 
 
 def zeros_after(inputs: PyTree[Array], shape: tuple[int, ...], dtype: DTypeLike) -> Array:
-    r"""Return zeros for a loop to write into, allocated only after other arrays are known.
+    r"""Return zeros for a loop to write into, allocated only after other arrays are computed.
 
-    A compiler allocates constants early and keeps one copy for all loops that begin with them;
-    each loop then copies it. Without this dependency a frame takes a third more memory, and its
-    gradient an eighth.
+    A compiler allocates constants early and keeps one copy for all loops that begin with them; each
+    loop then copies it. Without this dependency a frame takes a third more memory, and its gradient
+    an eighth more.
 
     **Arguments:**
 
-    - `inputs`: the last inputs of the loop to be computed; at least one element in all.
-    - `shape`, `dtype`: of the zeros.
+    - `inputs`: the inputs of the loop that are computed last, with at least one element in total.
+    - `shape`, `dtype`: shape and type of the zeros.
     """
     return jnp.full(shape, _hidden_zero(inputs).astype(dtype))
 
 
 def _hidden_zero(arrays: PyTree[Array]) -> Int[Array, ""]:
-    """Return 0, which the compiler cannot infer."""
+    """Return a 0 that the compiler cannot infer."""
     first = [leaf.reshape(-1)[0] > 0 for leaf in jax.tree.leaves(arrays) if leaf.size]
     return jnp.minimum(jnp.stack(first).astype(jnp.int32).sum(), 0)
 
 
 def jit_unless_traced(function: Function) -> Function:
-    r"""Compile a function as one program where it is called eagerly; inline it where it is called
-    within another program.
+    r"""Compile a function as one program when it is called eagerly; inline it within another
+    program.
 
-    Executed eagerly, each operation is a program of its own for every shape, and a single one takes
+    Executed eagerly, each operation would be a program of its own for every shape, and would take
     as long to compile as a dozen fused ones.
 
     **Arguments:**

@@ -1,5 +1,5 @@
-"""Combination of partial results of parts of the splats: one device has one part, a mesh one part
-per device, and a stream a sequence of parts.
+"""Combination of partial results of parts of the splats. One device has one part, a mesh has one
+part per device, and a stream is a sequence of parts.
 """
 
 import abc
@@ -18,9 +18,9 @@ Partial = TypeVar("Partial", bound=PyTree)
 
 
 class AbstractCombination(eqx.Module):
-    """Combines the results of parts. Static.
+    """A rule that combines the results of parts. Static.
 
-    Partial results are given one after the other, one for each part of this process.
+    Its methods take an iterable with one partial result for each part of this process.
     """
 
     @abc.abstractmethod
@@ -29,7 +29,7 @@ class AbstractCombination(eqx.Module):
 
     @abc.abstractmethod
     def largest(self, partials: Iterable[Partial]) -> Partial:
-        """Take the maximum over all parts, as a constant of the derivative."""
+        """Take the maximum over all parts; it is a constant for differentiation."""
 
     def fold(
         self, add: Callable[[Partial, Part], Partial], start: Partial, parts: Iterable[Part]
@@ -41,8 +41,8 @@ class AbstractCombination(eqx.Module):
 
 
 class DeviceMesh(AbstractCombination):
-    """Each device of a mesh, of any axes, has one part; inside `jax.shard_map`, by the collectives
-    of JAX. Without axes there is one device, and the collectives do nothing.
+    """Combine one part per device of a mesh by JAX's collectives, inside `jax.shard_map`. Without
+    axes there is one device, and the collectives do nothing.
     """
 
     axes: tuple[str, ...] = eqx.field(static=True, default=())
@@ -54,7 +54,7 @@ class DeviceMesh(AbstractCombination):
 
     @property
     def shares(self) -> PartitionSpec:
-        """Specify that rows are cut into a share for each device."""
+        """Return the specification that cuts rows into one share per device."""
         return PartitionSpec(self.axes)
 
     def total(self, partials):
@@ -83,7 +83,7 @@ class DeviceMesh(AbstractCombination):
 
 
 class PartByPart(AbstractCombination):
-    """Parts are computed one after the other, and only their results are kept."""
+    """Compute parts one after the other, and keep only their results."""
 
     def total(self, partials):
         return self._combine(jnp.add, partials)
@@ -96,7 +96,7 @@ class PartByPart(AbstractCombination):
         return self.fold(functools.partial(jax.tree.map, operation), next(remaining), remaining)
 
     def fold(self, add, start, parts):
-        # Wait, because parts that are read ahead of the computation would accumulate.
+        # Wait; otherwise parts that are read ahead of the computation accumulate in memory.
         return functools.reduce(lambda *pair: jax.block_until_ready(add(*pair)), parts, start)
 
 
@@ -115,8 +115,8 @@ def extreme(
 
 
 def lay_out(mesh: Mesh, trees: Partial, specs: PyTree[PartitionSpec]) -> Partial:
-    """Distribute trees of arrays over a mesh with explicit axes, by one specification for each tree
-    or array; for other meshes `shard_map` itself does so.
+    """Distribute trees of arrays over a mesh with explicit axes, by one specification per tree or
+    array. For other meshes `shard_map` does this itself.
     """
     if AxisType.Explicit not in mesh.axis_types:
         return trees

@@ -1,4 +1,4 @@
-"""Pictures for an sRGB display (IEC 61966-2-1), in 8 bits and as a PNG file."""
+"""Encoding of pictures for sRGB displays (IEC 61966-2-1), in 8 bits and as PNG."""
 
 import io
 
@@ -8,7 +8,9 @@ from PIL import Image
 
 
 def linear_to_srgb(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Encode linear light for an sRGB display; values beyond [0, 1] are clipped, NaN becomes 0."""
+    """Encode linear light for an sRGB display. Values outside [0, 1] are clipped, and NaN becomes
+    0.
+    """
     shown = np.where(np.isnan(linear), 0.0, np.clip(linear, 0.0, 1.0))
     return np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown ** (1 / 2.4) - 0.055)
 
@@ -42,7 +44,7 @@ def to_display(
 
 
 def png_of(image: UInt8[np.ndarray, "height width channels"]) -> bytes:
-    """Return the bytes of a PNG file."""
+    """Encode an image as the bytes of a PNG file."""
     file = io.BytesIO()
     Image.fromarray(image[..., 0] if image.shape[-1] == 1 else image).save(file, format="PNG")
     return file.getvalue()

@@ -1,21 +1,21 @@
-"""Format counts, numbers, errors and channel names for people to read."""
+"""Formatting of counts, numbers, errors and channel names as text."""
 
 import math
 from collections.abc import Iterable
 from typing import Any
 
-CHANNEL_COLORS = ("#c0392b", "#27853f", "#2c5aa0")  # of three, on white
+CHANNEL_COLORS = ("#c0392b", "#27853f", "#2c5aa0")  # for three channels, on white
 
 
 def channel_names(count: int) -> tuple[str, ...]:
-    """Return default names of channels: red, green and blue for three of them."""
+    """Return default names of channels; three are red, green and blue."""
     if count == 3:
         return ("red", "green", "blue")
     return tuple(f"channel {channel + 1}" for channel in range(count))
 
 
 def counted(count: int, noun: str) -> str:
-    """Format a count of things with a noun whose plural ends in s."""
+    """Format a count with a noun whose plural ends in s."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 

@@ -1,4 +1,4 @@
-"""Free memory, compared with the memory that a computation requires before it begins."""
+"""Checks that a computation fits into the free memory, before it begins."""
 
 import psutil
 
@@ -8,9 +8,9 @@ def check_memory(what: str, required: float, remedy: str, capacity: float | None
 
     **Arguments:**
 
-    - `what`: is held in memory.
-    - `required`: bytes, about.
-    - `remedy`: completes the sentence.
+    - `what`: what needs the memory, the subject of the error.
+    - `required`: approximate number of bytes.
+    - `remedy`: the end of the error.
     - `capacity`: bytes; by default the free memory of this machine.
 
     **Raises:** `ValueError` when `capacity` is less than `required`.
@@ -24,8 +24,8 @@ def check_memory(what: str, required: float, remedy: str, capacity: float | None
 
 
 def free_bytes() -> float:
-    """Read how much memory this process may still take: the free memory of the machine, within the
-    limit of the address space.
+    """Read how many bytes this process may still allocate: the free memory of the machine, or less
+    if the address space is limited.
     """
     free = float(psutil.virtual_memory().available)
     if hasattr(psutil, "RLIMIT_AS"):  # not on Windows and macOS

@@ -1,4 +1,4 @@
-"""The precision of products of matrices."""
+"""The precision of matrix products."""
 
 import functools
 from collections.abc import Callable
@@ -10,11 +10,11 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def full_precision(function: Function) -> Function:
-    """Multiply matrices in the precision of their elements: by default GPUs and TPUs round factors
-    in float32 to 11 or 8 bits.
+    """Make a function multiply matrices in the precision of their elements. By default GPUs and
+    TPUs round float32 factors to 11 or 8 bits.
 
-    A derivative has the precision of the function, except that of a `jax.custom_vjp`, which is
-    traced later.
+    Its derivatives have that precision too, except those of a `jax.custom_vjp`, which are traced
+    later.
     """
 
     @functools.wraps(function)

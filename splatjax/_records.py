@@ -1,4 +1,4 @@
-"""Records that convert their arguments: numbers, lists, tuples and NumPy arrays.
+"""Records that convert numbers, lists, tuples and NumPy arrays to JAX arrays.
 
     @record
     class Medium(eqx.Module):
@@ -8,10 +8,11 @@
             converter=numbers, metadata=valid("positive", lambda x: x > 0)
         )
 
-`Medium([0.02, 0.01], [1.1, 1.3], eta=1.4)` has three arrays of two channels. An annotation states
-the axes of a field, and its converter states, to type checkers as well, what may be given. `record`
-converts all fields together: the length and the precision of one depend on the others. The range
-of a field stands in its metadata (`valid`); what concerns several is checked in `__check_init__`.
+`Medium([0.02, 0.01], [1.1, 1.3], eta=1.4)` has three arrays of two channels. The annotation of a
+field states its axes; its converter states, for type checkers too, the types that it accepts.
+`record` converts all fields together, because the length and the precision of one depend on the
+others. The metadata of a field (`valid`) state its range; conditions on several fields are checked
+in `__check_init__`.
 """
 
 import dataclasses
@@ -31,44 +32,43 @@ from jaxtyping import Array, DTypeLike
 
 Class = TypeVar("Class", bound=type)
 Item = TypeVar("Item")
-# Numbers, lists, tuples and arrays: everything that can be read as an array.
+# Everything that can be converted to an array.
 Numbers: TypeAlias = ArrayLike | Sequence[Any] | jax.ShapeDtypeStruct
 
 
 def numbers(values: Numbers | None) -> Any:
-    """Mark a field, as its converter, as taking numbers of any kind."""
+    """Mark a field, as its converter, as one that accepts `Numbers`."""
     return values
 
 
 def several(values: Item | Sequence[Item]) -> Any:
-    """Mark that a field takes a list or tuple of records, or a single one."""
+    """Mark a field, as its converter, as one that accepts a record or several records."""
     return values
 
 
 def valid(
     requirement: str, holds: Callable[[np.ndarray], Any] = lambda x: x == x, finite: bool = True
 ) -> dict[str, Any]:
-    """State the valid values of a field, as metadata for `check_values`."""
+    """Make field metadata that state the valid values, as arguments of `check_values`."""
     return {"valid": (requirement, holds, finite)}
 
 
 def record(cls: Class) -> Class:
     r"""Convert the arguments of a class of records before its `__init__` sees them.
 
-    - Fields of `numbers` become strongly typed arrays of floats, in the precision of the first
-      array given, arrays in other records first, else in JAX's default. A number is repeated along
-      axes whose lengths other fields give; the `channels` of a record among the fields count. An
-      array that lacks its last axis `channels` has one channel.
+    - Fields of `numbers` become strongly typed arrays of floats. Their precision is that of the
+      first floating-point array among the fields (records first), or JAX's default. A number is
+      repeated along axes whose lengths are known from other fields, or from the `channels` of a
+      record. An array without the last axis `channels` gets one channel.
     - Fields of `several` records become tuples.
-    - Fields of records are refused when they are records of other classes, or numbers.
-    - Values that are not `valid` are refused, and arrays of whole numbers for a field whose
-      metadata state that it is `linear` light.
+    - Fields of records must be records of the annotated class.
+    - Values must be `valid`. Fields whose metadata state `linear` (light) refuse integer arrays.
 
-    Traced values are converted like others. `None` and objects that are no numbers, such as the
-    placeholders of JAX, pass unchanged. Records that JAX unflattens are not converted again.
+    Traced values are converted too. `None` and objects that are not numbers, such as JAX's
+    placeholders, pass unchanged. Records that JAX unflattens are not converted again.
 
-    **Raises:** `ValueError`, when a record is made, naming the field, its shape or class, and what
-    would be right.
+    **Raises:** `ValueError`, when a record is made, with the field, its shape or class, and the
+    remedy.
     """
     initialize, signature = cls.__init__, inspect.signature(cls)
     axes, classes, declared = {}, {}, dataclasses.fields(cls)  # ty: ignore[invalid-argument-type]
@@ -108,7 +108,7 @@ def record(cls: Class) -> Class:
         for name, requirement in ranges.items():
             check_values(f"{cls.__name__}.{name}", getattr(self, name), *requirement)
 
-    # No annotations here: runtime type checkers would refuse arguments before their conversion.
+    # Without annotations, because runtime type checkers would refuse arguments before conversion.
     receiver = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
     fields = [part.replace(annotation=part.empty) for part in signature.parameters.values()]
     __init__.__signature__ = inspect.Signature([receiver, *fields])  # ty: ignore[missing-attribute]
@@ -117,13 +117,13 @@ def record(cls: Class) -> Class:
 
 
 def require(holds: Any, message: str) -> None:
-    """Raise `ValueError` with a message unless a condition holds."""
+    """Raise `ValueError(message)` unless a condition holds."""
     if not holds:
         raise ValueError(message)
 
 
 def check_class(name: str, value: Any, *kinds: type) -> None:
-    """Raise `ValueError` for a value that is no record of one of some classes."""
+    """Raise `ValueError` unless a value is an instance of one of the classes."""
     if not isinstance(value, kinds):
         raise ValueError(
             f"{name} must be {' or '.join(map(_call, kinds))}; got {type(value).__name__}"
@@ -140,7 +140,7 @@ def check_installed(use: str, module: str, package: str | None = None) -> None:
 
 
 def _call(cls: type) -> str:
-    """Write out a call of a class with the names of its arguments; an abstract one has none."""
+    """Format a call of a class with its parameters; an abstract class has none."""
     parameters = ", ".join(inspect.signature(cls).parameters)
     return f"{cls.__name__}({parameters})" if parameters else cls.__name__
 
@@ -160,7 +160,7 @@ def as_floats(values: Numbers, dtype: DTypeLike | None = None, name: str = "valu
 
 
 def is_traced(tree: Any) -> bool:
-    """Return whether a tree has a traced array, whose values are unknown."""
+    """Return whether a tree contains a traced array."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
@@ -171,18 +171,19 @@ def check_values(
     holds: Callable[[np.ndarray], Any],
     finite: bool = True,
 ) -> None:
-    r"""Check a number, or every entry of an array. Unknown entries, as under `jit`, pass.
+    r"""Check a number, or every entry of an array. Traced values are not checked.
 
     **Arguments:**
 
-    - `name`: of the values, for the error.
+    - `name`: name of the values in the error.
     - `values`: a number or an array; other objects pass.
     - `requirement`: completes "must be", with the remedy.
-    - `holds`: returns for each entry whether it meets the requirement, which two numbers meet only
-      if all between them do.
-    - `finite`: whether infinite entries are refused. NaN always is.
+    - `holds`: computes elementwise whether entries meet the requirement. The valid numbers must
+      form an interval.
+    - `finite`: whether infinite entries are refused; NaN always is.
 
-    **Raises:** `ValueError` with the number, or how many entries fail and the first of them.
+    **Raises:** `ValueError` with the number, or with the count of invalid entries and the first of
+    them.
     """
     kinds = jax.Array | np.ndarray | np.number | int | float
     is_known = isinstance(values, kinds) and not is_traced(values)
@@ -207,7 +208,7 @@ _RECORDS = (eqx.Module, NoneType)
 
 
 def _is_placeholder(value: Any) -> bool:
-    """Return whether a value is `None` or an object of JAX that stands for an array or a record."""
+    """Return whether a value is `None` or a placeholder of JAX for an array or a record."""
     convertible = bool | int | float | complex | str | list | tuple | eqx.Module
     return not isinstance(value, convertible) and not hasattr(value, "__array__")
 
@@ -215,7 +216,7 @@ def _is_placeholder(value: Any) -> bool:
 def _converted(
     record: str, axes: dict[str, list[str]], values: dict[str, Any], records: list
 ) -> dict[str, Array]:
-    """Convert the values of all fields of numbers."""
+    """Convert the values of all fields of `numbers`."""
     inputs = {name: values[name] for name in axes if not _is_placeholder(values[name])}
     precision = _precision([records, list(inputs.values())])
     arrays = {
@@ -231,9 +232,7 @@ def _converted(
 
 
 def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) -> Array:
-    """Add the axes that a number or a single channel lacks, and add the lengths of all axes to the
-    known ones.
-    """
+    """Add the axes that a number or a single channel lacks, and record the lengths of all axes."""
     if any(axis.startswith("*") for axis in axes):
         return array
     if array.ndim == 0 and axes and all(axis in lengths for axis in axes):
@@ -241,7 +240,7 @@ def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) 
     if array.ndim == len(axes) - 1 and axes[-1].lstrip("#") == "channels":
         array = array[..., None]
     required = [int(axis) if axis.isdigit() else lengths.get(axis, axis) for axis in axes]
-    # A string is an axis whose length no other field gives.
+    # A string is an axis of unknown length.
     matches = [
         actual == length or isinstance(length, str)
         for actual, length in zip(array.shape, required, strict=False)
@@ -257,7 +256,7 @@ def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) 
 
 
 def _precision(tree: Any) -> Any:
-    """Return the precision of the first array of floats; numbers of other kinds have none."""
+    """Return the dtype of the first floating-point array, at least float32, or JAX's default."""
     for leaf in jax.tree.leaves(tree):
         is_strong = isinstance(leaf, jax.Array | np.ndarray) and not getattr(
             leaf, "weak_type", False

@@ -7,15 +7,15 @@ _ALBEDO_FLOOR = 1e-4
 
 
 def smooth_step(x, low, high):
-    """Compute 0 below `low`, 1 above `high`, a cubic between; reversed when `low > high`. Of arrays
-    of NumPy or JAX.
+    """Compute the smooth step of NumPy or JAX arrays: 0 below `low`, 1 above `high`, a cubic
+    between, and the reverse for `low > high`.
     """
     t = ((x - low) / (high - low)).clip(0, 1)
     return t * t * (3 - 2 * t)
 
 
 def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Compute `sqrt(max(albedo, 1e-4))`: half of the color acts before light spreads, half after.
+    """Compute `sqrt(max(albedo, 1e-4))`, the factor of the albedo before and again after diffusion.
 
     **Arguments:**
 
@@ -23,7 +23,7 @@ def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
       sqrt(albedo))` above the floor and 0 at and below it, since the derivative of the root itself
       diverges at a black texel.
 
-    **Returns:** at least 0.01; its square is the albedo, except for texels darker than 1e-4.
+    **Returns:** at least 0.01. Its square is the albedo, except for texels darker than 1e-4.
 
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14): pre- and post-scatter texturing in
     equal parts.
@@ -32,8 +32,8 @@ def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def mean_decay(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Compute `(1 - exp(-x)) / x`, the mean of `exp(-t)` from 0 to x: 1 at 0, with the derivative
-    -1/2.
+    """Compute `(1 - exp(-x)) / x`, the mean of `exp(-t)` from 0 to x. At 0 it is 1, and its
+    derivative is -1/2.
     """
     is_small = x < 1e-2
     small, large = jnp.where(is_small, x, 0.0), jnp.where(is_small, 1.0, x)

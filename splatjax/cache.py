@@ -1,14 +1,14 @@
-"""A cache of results for the next start of a program, in a folder of the user: the bust, plans, and
-compiled pictures.
+"""A cache on disk of expensive results, for the next start of a program: the bust, plans and
+compiled programs.
 
     import splatjax as sj
 
     sj.cache.keep()
 
-Nothing is cached before this call. A file is used only if everything that it depends on is the
-same: inputs, the source of splatjax, the versions of JAX and others, JAX's settings, and the
-processor. Files are pickled: the folder must belong to the user, and nobody else may write to it.
-Damaged or foreign files are ignored and replaced.
+Nothing is cached before this call. A file is used only if everything that it depends on is
+unchanged: inputs, the source of splatjax, the versions of JAX and other packages, JAX's settings,
+and the processor. Files are pickled, so the folder must belong to the user, and nobody else may
+write to it. Damaged or foreign files are ignored and replaced.
 """
 
 import functools
@@ -36,14 +36,15 @@ from jax.tree_util import PyTreeDef
 from splatjax._library import profiles_folder
 from splatjax._precision import Function, full_precision
 
-_LARGEST = 1 << 30  # bytes in the folder, beyond which what was not used for longest is deleted
-_EFFECTLESS = re.compile("cache|log|platform")  # settings of JAX that no result depends on
-# Events of JAX when its cache lacks a small program, and of this module before a picture's.
+_LARGEST = 1 << 30  # bytes in the folder, beyond which the least recently used files are deleted
+_EFFECTLESS = re.compile("cache|log|platform")  # settings of JAX that do not change results
+# Events that JAX records when its cache lacks a small program, and this module before it compiles a
+# picture.
 _COMPILING = "/jax/compilation_cache/cache_misses", "/splatjax/cache/compiling"
 _LEAST_TIME = "jax_persistent_cache_min_compile_time_secs"
-# JAX's settings, unless its environment variables decide otherwise.
+# Settings of JAX, unless environment variables set them.
 _SETTINGS = {
-    # Planning runs many small programs, each compiled in a moment and together in seconds.
+    # Planning runs many small programs that together take seconds to compile.
     _LEAST_TIME: 0.0,
     # XLA logs an error of 4,000 characters for each program that it takes from the cache and runs
     # (JAX issue 38445).
@@ -77,10 +78,10 @@ def keep(
 ) -> Path:
     r"""Enable the cache: store expensive results, and read them at the next start.
 
-    `splatjax.bust`, `splatjax.make_plan`, `splatjax.render` and the other functions of pictures and
-    light, called outside `jit`, `grad` and `vmap` on one device, are then fast from the second
-    start on. JAX's own compilation cache in the same folder stores other programs, gradients among
-    them. Call it once, before any computation.
+    Call it once, before any computation. From the second start on, `splatjax.bust`,
+    `splatjax.make_plan`, `splatjax.render` and the other functions of pictures and light are fast
+    when they are called on one device, outside `jit`, `grad` and `vmap`. JAX's own compilation
+    cache, in the same folder, stores other programs such as gradients.
 
     It sets `jax_compilation_cache_dir` if it is not set, and
     `jax_persistent_cache_min_compile_time_secs` and `jax_logging_level` unless environment
@@ -88,17 +89,17 @@ def keep(
 
     **Arguments:**
 
-    - `folder`: created if missing. By default the folder of the command line: `splatjax/jax` in the
-      absolute path `XDG_CACHE_HOME`, or in `~/.cache`. It may be deleted at any time; besides JAX's
-      own files it takes 1 GB at most.
-    - `compiler_options`: options of XLA for the programs of pictures. If XLA lacks one of them, it
-      gets none. With `{"xla_cpu_use_fusion_emitters": False}` programs compile in three quarters of
-      the time, and run a tenth slower.
+    - `folder`: created if missing; by default `splatjax/jax` in the absolute path `XDG_CACHE_HOME`
+      or in `~/.cache`, which the command line uses too. It may be deleted at any time. It takes at
+      most 1 GB besides JAX's own files.
+    - `compiler_options`: options of XLA for the programs of pictures; if XLA lacks one of them, all
+      are dropped. With `{"xla_cpu_use_fusion_emitters": False}` programs compile in three quarters
+      of the time and run a tenth slower.
 
     **Returns:** the subfolder for this kind of processor.
 
-    **Raises:** `OSError` when the folder cannot be made; `PermissionError` when `kept` in it
-    belongs to another user, or others may write to it; then only JAX's cache is used.
+    **Raises:** `OSError` if the folder cannot be created; `PermissionError` if its subfolder `kept`
+    belongs to another user or others may write to it. Then only JAX's cache is used.
     """
     global _folder, _compiler_options
     for name, value in _SETTINGS.items():
@@ -111,21 +112,21 @@ def keep(
     kept_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if jax.config.jax_compilation_cache_dir is None:  # ty: ignore[missing-attribute]
         jax.config.update("jax_compilation_cache_dir", str(cache_folder))
-    if not _is_private(kept_folder):  # or the system does not show whose it is
+    if not _is_private(kept_folder):  # or the owner is unknown
         raise PermissionError(f"{kept_folder}: other users may write to this folder; delete it")
-    _source()  # now, since files may change while the program runs
+    _source()  # read now, since files may change while the program runs
     _folder, _compiler_options = kept_folder, dict(compiler_options)
     return cache_folder
 
 
 def reuse_capacity(kind: Hashable, least: int, capacity: int, most: float = 1.25) -> int:
-    """Return a capacity for arrays of a kind, if possible one for which programs are compiled
-    already.
+    """Return a capacity for arrays of a kind, preferably one for which programs are already
+    compiled.
 
-    That is the smallest capacity that this process has planned before, from `least` up to `most`
-    times `capacity`. If there is none, `capacity` is remembered and returned.
+    Among the capacities that this process planned before, it is the smallest from `least` up to
+    `most` times `capacity`. If there is none, `capacity` is remembered and returned.
 
-    With several processes, which must run the same programs, nothing is remembered.
+    With several processes nothing is remembered, because all must run the same programs.
     """
     if jax.process_count() > 1:
         return capacity
@@ -154,7 +155,7 @@ def kept(function: Function) -> Function:
 
 def kept_jit(function: Function) -> Function:
     """Compile a function of arrays, like `eqx.filter_jit`, and cache its programs by the structure
-    and the shapes of the arguments, so that nothing is traced. Numbers are static.
+    and the shapes of the arguments, so that a cached program needs no tracing. Numbers are static.
     """
     compiled = eqx.filter_jit(function)
 
@@ -166,9 +167,9 @@ def kept_jit(function: Function) -> Function:
             return compiled(*arguments)
         leaves = jax.tree.leaves(eqx.filter(arguments, eqx.is_array))
         if path not in _programs:
-            with suppress(Exception):  # whatever is wrong with a file, it is made again
+            with suppress(Exception):  # a damaged file is replaced
                 content, returned, calls_lapack = _read(path)
-                if calls_lapack:  # which JAX finds when it lowers the first call of it, not before
+                if calls_lapack:  # JAX loads it when it first lowers a call
                     jax.jit(jnp.linalg.cholesky).lower(jnp.eye(1))
                 structures = jax.tree.structure(((leaves,), {})), jax.tree.structure(returned)
                 devices = list(leaves[0].devices())
@@ -187,12 +188,12 @@ def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
     leaves, structure = jax.tree.flatten(arrays)
     jax.monitoring.record_event(_COMPILING[1])
 
-    # Of a list of arrays: a program that is loaded cannot make records of its arguments.
+    # The program takes a list of arrays, because a loaded program cannot make records.
     def of_leaves(leaves):
         return function(*eqx.combine(jax.tree.unflatten(structure, leaves), static))
 
     with ExitStack() as stack:
-        # JAX's cache is off here: an executable read from it and serialized again lacks kernels.
+        # JAX's cache is off here: an executable that is read from it lacks kernels when serialized.
         stack.callback(jax.config.update, _LEAST_TIME, jax.config.values[_LEAST_TIME])
         jax.config.update(_LEAST_TIME, float("inf"))
         lowered = jax.jit(of_leaves).lower(leaves)
@@ -210,9 +211,9 @@ def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
 
 
 def _path(function: Any, arguments: Any, *, by_values: bool) -> Path | None:
-    """Return the path of the file for a function and its arguments. `None` where nothing is kept:
-    before `keep`, while JAX traces, on several devices, and where code from outside splatjax has a
-    part in it.
+    """Return the path of the file for a function and its arguments. It is `None` where nothing is
+    cached: before `keep`, while JAX traces, on several devices, and with classes from outside
+    splatjax.
     """
     leaves, structure = jax.tree.flatten(arguments)
     arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
@@ -224,7 +225,7 @@ def _path(function: Any, arguments: Any, *, by_values: bool) -> Path | None:
         or any(isinstance(array, Tracer) for array in arrays)
         or len(devices := {device for array in arrays for device in array.devices()}) > 1
         or not all(kind.startswith(("builtins.", "splatjax.")) for kind in _kinds(structure))
-        or "<" in str(structure)  # a static function or object, which its text does not describe
+        or "<" in str(structure)  # a static function or object, which its repr does not identify
     ):
         return None
     different = {id(array): array for array in arrays if by_values}
@@ -251,8 +252,8 @@ def _kinds(structure: PyTreeDef) -> list[str]:
 
 @functools.cache
 def _processor() -> str:
-    """Return a name for the kind of processor: home folders are shared by machines, and JAX keeps
-    the code of all under one name.
+    """Return a name for the kind of processor. Machines may share home folders, and JAX does not
+    distinguish their code.
     """
     path = Path("/proc/cpuinfo")
     text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
@@ -263,7 +264,7 @@ def _processor() -> str:
 
 @functools.cache
 def _source() -> bytes:
-    """Return a digest of the modules of splatjax, and of the data that they read."""
+    """Compute a digest of the modules of splatjax and of the data that they read."""
     files = *Path(__file__).parent.rglob("*.py"), *profiles_folder().glob("*.npz")
     return _digest(*(path.read_bytes() for path in sorted(files)))
 
@@ -273,13 +274,13 @@ def _digest(*contents: bytes) -> bytes:
 
 
 def _is_private(path: Path) -> bool:
-    """Return whether a file or folder belongs to the user, and nobody else may write to it."""
+    """Return whether a file or folder belongs to the user and nobody else may write to it."""
     status = path.stat()
     return hasattr(os, "getuid") and status.st_uid == os.getuid() and not status.st_mode & 0o022
 
 
 def _read(path: Path) -> Any:
-    """Read what `_write` wrote to this path, `None` where nothing sound is there."""
+    """Read a file of `_write`; return `None` if it is missing or damaged."""
     with suppress(Exception):
         content = path.read_bytes()
         if _is_private(path) and content[:32] == _digest(path.name.encode(), content[32:]):
@@ -289,17 +290,15 @@ def _read(path: Path) -> Any:
 
 
 def _write(path: Path, content: Any) -> Any:
-    """Write a file, whole or not at all; delete what was not used for longest; return the
-    content.
-    """
-    with suppress(Exception):  # what cannot be kept is made again at the next start
+    """Write a file atomically, delete the least recently used files, and return the content."""
+    with suppress(Exception):  # without a file, the next start computes the result again
         packed = pickle.dumps(content)
         if len(packed) > _LARGEST // 4:
             return content
         with suppress(FileNotFoundError), tempfile.NamedTemporaryFile(dir=path.parent) as file:
             file.write(_digest(path.name.encode(), packed) + packed)
             file.flush()
-            os.replace(file.name, path)  # so that there is nothing to delete in the end
+            os.replace(file.name, path)  # the temporary file is gone, so its deletion is skipped
         total = 0
         for entry in sorted(path.parent.iterdir(), key=lambda entry: -entry.stat().st_mtime):
             total += entry.stat().st_size

@@ -1,5 +1,6 @@
-"""Materials as parameters of other renderers: a sum of Gaussians as a single length, as kernels for
-screen space, and as plain numbers and text; a material as the subsurface of OpenPBR and of glTF.
+"""Export of materials as parameters of other renderers: sums of Gaussians as a single length, as
+screen-space kernels, and as plain numbers and text; materials as the subsurface of OpenPBR and of
+glTF.
 """
 
 from typing import Any
@@ -15,13 +16,13 @@ from splatjax.scene import Material
 
 
 def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
-    r"""Compute the length `d` with which normalized diffusion, `(exp(-r/d) + exp(-r/3d)) / (8 pi d
-    r)`, has the same mean distance as the Gaussians. It is the scattering distance of Unity's High
-    Definition Render Pipeline, whose shape parameter is `1 / d`.
+    r"""Compute the length `d` with which normalized diffusion,
+    `(exp(-r/d) + exp(-r/3d)) / (8 pi d r)`, has the same mean distance as the Gaussians. It is the
+    scattering distance of Unity's HDRP, whose shape parameter is `1 / d`.
 
-    The mean distance of normalized diffusion is `2.5 d`, and that of the Gaussians is `sum_i w_i
-    sqrt(pi v_i / 2) / sum_i w_i`. The curves differ: normalized diffusion is infinite at the
-    origin.
+    The mean distance of normalized diffusion is `2.5 d`, and that of the Gaussians is
+    `sum_i w_i sqrt(pi v_i / 2) / sum_i w_i`. The profiles differ, since normalized diffusion is
+    infinite at the origin.
 
     **Arguments:**
 
@@ -29,20 +30,20 @@ def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
 
     **Returns:** mm.
 
-    **Source:** the profile: Christensen and Burley 2015; matching the mean distance is ours.
+    **Source:** Christensen and Burley 2015 (profile); matching the mean distance is our own.
     """
     distances = jnp.sqrt(0.5 * jnp.pi * gaussians.variances)
     return distances @ gaussians.weights / (2.5 * gaussians.total_reflectance())
 
 
 def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
-    r"""Compute the radius for Blender's method Christensen-Burley, at scale 1: `4 pi s(A) d`, with
+    r"""Compute the radius for Blender's method Christensen-Burley at scale 1, `4 pi s(A) d`, with
     the total reflectance A and the `d` of `burley_distance`.
 
-    Cycles uses `l = radius / (4 pi)` as the mean free path, and then `d = l / s(A)`, with the curve
-    `s` for diffuse transmission (`diffuse_scaling`).
+    Cycles computes the mean free path `l = radius / (4 pi)` and then `d = l / s(A)`, with `s` for
+    diffuse incident light (`diffuse_scaling`).
 
-    **Returns:** mm; divide by 1000 for Blender's unit of length, the meter.
+    **Returns:** mm; divide by 1000 for Blender's unit, the meter.
 
     **Source:** Blender Foundation, Cycles, `kernel/closure/bssrdf.h`; Christensen and Burley 2015,
     Eq. 6.
@@ -53,14 +54,13 @@ def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
 def mean_free_path(material: Material, g: float = 0.0) -> Float[Array, " channels"]:
     r"""Compute the mean free path of a material, `1 / (sigma_a + sigma_s' / (1 - g))`.
 
-    It is that of the material's coefficients if there are any, reduced for a mean cosine `g` of 0.
-    Otherwise it is `s(A) d`, with the
-    total reflectance A and the `d` of `burley_distance`, by which normalized diffusion is as wide
-    as the Gaussians.
+    It is computed from the material's coefficients if there are any; for `g = 0` it is the reduced
+    mean free path. Otherwise it is `s(A) d`, with the total reflectance A and the `d` of
+    `burley_distance`, so that normalized diffusion is as wide as the Gaussians.
 
     **Returns:** mm.
 
-    **Source:** the curve `s` for diffuse transmission: Christensen and Burley 2015, Eq. 6.
+    **Source:** Christensen and Burley 2015, Eq. 6 (`s` for diffuse incident light).
     """
     if material.medium is not None:
         return 1 / (material.medium.sigma_a + material.medium.sigma_s_prime / (1 - g))
@@ -72,14 +72,14 @@ def openpbr_subsurface(
 ) -> dict[str, Float[Array, ""] | Float[Array, " channels"]]:
     r"""Compute the subsurface parameters of OpenPBR.
 
-    With coefficients, it is the inverse of `HalfSpace.of_color`: the color of a flat surface whose
-    index reflects light back into the body. OpenPBR's own formula omits this reflection, and agrees
-    to 0.6% for equal indices. Without, the color is the total reflectance.
+    With coefficients, this is the inverse of `HalfSpace.of_color`, which includes the light that
+    the surface reflects back into the body. OpenPBR's own formula omits this reflection, and agrees
+    to 0.6% for equal indices. Without coefficients, the color is the total reflectance.
 
     **Arguments:**
 
     - `material`: Differentiable.
-    - `g`: mean cosine of the phase function of its coefficients (`io.load_mean_cosine`).
+    - `g`: mean cosine of the material's phase function (`io.load_mean_cosine`).
 
     **Returns:** `subsurface_color`, `subsurface_radius` (the largest mean free path, mm),
     `subsurface_radius_scale`, and `subsurface_scatter_anisotropy`, which is `g`.
@@ -103,10 +103,10 @@ def openpbr_subsurface(
 def gltf_volume(
     material: Material,
 ) -> tuple[Float[Array, ""], Float[Array, " channels"], Float[Array, " channels"]]:
-    r"""Compute the volume of a glTF material.
+    r"""Compute the volume parameters of a glTF material.
 
-    Light is attenuated by absorption and scattering. The multiple-scattering color of an albedo
-    `a` is `((p - s)^2 - u) / (v - 2 q (p - s))` with `s = sqrt(1 - a)`, the inverse of
+    Absorption and scattering both attenuate light. The multiple-scattering color of an albedo `a`
+    is `((p - s)^2 - u) / (v - 2 q (p - s))` with `s = sqrt(1 - a)`, the inverse of
     `1 - (p + q c - sqrt(u + v c + q^2 c^2))^2`. Without coefficients it is the total reflectance.
 
     **Arguments:**
@@ -116,8 +116,8 @@ def gltf_volume(
     **Returns:** the attenuation distance, mm, the attenuation color, and the multiple-scattering
     color.
 
-    **Source:** Khronos, KHR_materials_volume and the draft of KHR_materials_volume_scatter; the
-    formula: Kulla and Conty 2017, "Revisiting Physically Based Shading at Imageworks".
+    **Source:** Khronos, KHR_materials_volume and the draft of KHR_materials_volume_scatter; Kulla
+    and Conty 2017, "Revisiting Physically Based Shading at Imageworks" (formula).
     """
     color, medium, lengths = material.total_reflectance(), material.medium, mean_free_path(material)
     if medium is not None:
@@ -132,27 +132,26 @@ def gltf_volume(
 def separable_kernel(
     gaussians: SumOfGaussians, samples: int = 25, reach: float | None = None
 ) -> tuple[Float[Array, " samples"], Float[Array, "samples channels"]]:
-    r"""Compute a kernel for separable subsurface scattering: one blur along each axis of the
+    r"""Compute a kernel for separable subsurface scattering, which blurs along each axis of the
     screen.
 
-    Offsets are denser toward the middle, `reach sign(t) t^2` for equally spaced `t` from -1 to 1; a
-    weight is the profile at the offset times half the distance between the neighbors, and the
-    weights of a channel add up to 1. Two such blurs in turn are not the radial profile, unless it
-    is one Gaussian.
+    Offsets are denser near the center: `reach sign(t) t^2` for equally spaced `t` from -1 to 1. A
+    weight is the profile at the offset times half the distance between the neighboring offsets; the
+    weights of a channel sum to 1. The two blurs together equal the radial profile only for a single
+    Gaussian.
 
     **Arguments:**
 
     - `gaussians`: Differentiable.
     - `samples`: odd, at least 3.
-    - `reach`: largest offset, mm; by default twice the root of the mean squared distance per axis
-      of the widest channel.
+    - `reach`: largest offset, mm; by default twice the root mean square distance per axis of the
+      widest channel.
 
-    **Returns:** offsets, mm, ascending, and the weights at them.
+    **Returns:** the ascending offsets, mm, and their weights.
 
     **Raises:** `ValueError` for an even number of samples, or fewer than 3.
 
-    **Source:** Jimenez et al. 2015, "Separable subsurface scattering", and the code that comes with
-    it.
+    **Source:** Jimenez et al. 2015, "Separable subsurface scattering", and its published code.
     """
     if samples < 3 or samples % 2 == 0:
         raise ValueError(
@@ -168,11 +167,11 @@ def separable_kernel(
 
 
 def data_sheet(gaussians: SumOfGaussians) -> dict[str, Any]:
-    r"""Compute all exports of a sum of Gaussians, each with its formula, unit and source: lists,
+    r"""Compute all exports of a sum of Gaussians, each with its formula, unit and source, as lists,
     numbers and text.
 
-    **Returns:** a dictionary that JSON can hold, with the entries `gaussians`, `gpu_gems`,
-    `separable_kernel`, `burley`, `unity` and `blender`.
+    **Returns:** a dictionary for JSON with the entries `gaussians`, `gpu_gems`, `separable_kernel`,
+    `burley`, `unity` and `blender`.
     """
     offsets, weights = separable_kernel(gaussians)
     return {
@@ -233,10 +232,10 @@ def data_sheet(gaussians: SumOfGaussians) -> dict[str, Any]:
 
 
 def plain_numbers(values: Any) -> Any:
-    """Convert to the shortest Python numbers that are read back exactly."""
+    """Convert numbers to the shortest Python numbers that restore them exactly."""
     values = np.asarray(values)
     if values.dtype == np.float32:
-        # Not `str`, which shows six digits once colour-science has been imported.
+        # Not `str`, which shows six digits once colour-science is imported.
         shortest = [float(np.format_float_scientific(x)) for x in values.ravel()]
         return np.reshape(shortest, values.shape).tolist()
     return values.tolist()

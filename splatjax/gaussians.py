@@ -1,4 +1,4 @@
-"""The normalized Gaussian, profiles, and the sum of Gaussians, which fits and renderer share."""
+"""The normalized Gaussian, profiles, and sums of Gaussians, shared by fits and renderer."""
 
 import abc
 from typing import ClassVar
@@ -18,7 +18,8 @@ def gaussian(
 ) -> Float[Array, "..."]:
     r"""Compute the normalized two-dimensional Gaussian of Eq. 2, `exp(-r^2 / 2v) / (2 pi v)`.
 
-    It is a function of the squared radius, so that no square root is differentiated in positions.
+    The argument is the squared radius, so that derivatives with respect to positions need no square
+    root.
 
     **Arguments:**
 
@@ -42,8 +43,8 @@ class AbstractProfile(eqx.Module):
 
     - `singular`: whether the profile diverges like 1/r at the origin, so that the integrals of Eq.
       3 and 4 need a cut.
-    - `has_separate_channels`: whether every array of the profile has one entry for each channel, on
-      which no other channel depends: integrals over other radii in each are then faster.
+    - `has_separate_channels`: whether each channel depends only on its own entry of every array of
+      the profile. Integrals over different radii per channel are then faster.
     """
 
     singular: ClassVar[bool] = False
@@ -61,28 +62,27 @@ class AbstractProfile(eqx.Module):
 
     @abc.abstractmethod
     def length_scale(self) -> Float[Array, " channels"]:
-        """Compute the distance (mm) over which the core of the profile changes: the unit of radii
-        in quadrature.
+        """Compute the distance (mm) over which the core of the profile varies. Quadrature rules use
+        it as the unit of radius.
         """
 
     def known_radii(self) -> tuple[Float[Array, " samples"], Float[Array, " samples"]] | None:
-        """Return the radii at which a measured profile is known, and their weights `dr` (mm): its
-        integrals are sums over them. `None` for a profile known everywhere.
+        """Return the radii at which a measured profile is known and their weights `dr` (mm), for
+        integrals; `None` for a profile known at all radii.
         """
         return None
 
 
 @record
 class SumOfGaussians(AbstractProfile):
-    r"""A profile as a sum of Gaussians, `sum_i w_i G(v_i, r)` (Eq. 2).
+    r"""A profile that is a sum of Gaussians, `sum_i w_i G(v_i, r)` (Eq. 2).
 
-    All channels share the variances, because one set of layers is rendered for all.
+    All channels share the variances, because one set of layers is rendered for all channels.
 
     **Attributes:**
 
     - `variances`: mm^2, per axis. Differentiable.
-    - `weights`: energies; their sum over the Gaussians is the total reflectance of a channel.
-      Differentiable.
+    - `weights`: energies; their sum over the Gaussians is the total reflectance. Differentiable.
     """
 
     variances: Float[Array, " gaussians"] = eqx.field(
@@ -109,17 +109,17 @@ class SumOfGaussians(AbstractProfile):
         return jnp.full_like(self.weights[0], jnp.sqrt(jnp.min(self.variances)))
 
     def blurred(self, variance: Float[Array, ""] | float) -> "SumOfGaussians":
-        """Convolve the profile with a Gaussian of a variance (mm^2 per axis): variances add."""
+        """Convolve the profile with a Gaussian of a given variance, mm^2 per axis."""
         return SumOfGaussians(self.variances + variance, self.weights)
 
     def white(self) -> "SumOfGaussians":
-        """Divide the weights of each channel by their sum."""
+        """Scale the weights of each channel to sum to 1."""
         return SumOfGaussians(self.variances, self.weights / jnp.sum(self.weights, axis=0)[None])
 
 
 def pad_gaussians(gaussians: SumOfGaussians) -> SumOfGaussians:
-    """Add Gaussians without weight, too narrow to be resolved, beyond three up to a multiple of
-    three. Not for traced arrays; nothing is compiled.
+    """Pad more than three Gaussians to a multiple of three with unresolvably narrow ones of weight
+    0. Not for traced arrays.
     """
     count = len(gaussians.variances)
     lacking = -count % 3 if count > 3 else 0

@@ -1,4 +1,4 @@
-"""Figures of profiles, fits, errors and pictures, by matplotlib."""
+"""Figures of profiles, fits, errors and pictures, drawn with matplotlib."""
 
 from collections.abc import Sequence
 
@@ -17,15 +17,15 @@ from splatjax.io import linear_to_srgb
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
 _POINTS = 400
-# Share of its peak down to which a profile is drawn.
+# Fraction of its peak down to which a profile is drawn.
 _TAIL = 1e-7
-# Of light by logarithmic radius, over its peak, from which on errors are drawn.
+# Light per logarithmic radius, relative to its peak, above which errors are drawn.
 _LEAST = 1e-2
-# Radii of a measurement, up to which each is marked.
+# Largest number of measured radii that are marked individually.
 _FEW = 60
-# Relative error of the energy that is rounding.
+# Relative error of the energy below which it counts as rounding.
 _HELD = 1e-6
-# Quantile of a row's values that is shown as white.
+# Quantile of the values of a row that is shown as white.
 _BRIGHTEST = 0.995
 
 
@@ -36,19 +36,19 @@ def plot_fit(
     rule: AbstractRadialRule = L2_QUADRATURE,
     title: str | None = None,
 ) -> Figure:
-    r"""Draw a profile and its fit, on linear and on logarithmic axes, and the relative error of the
-    fit by distance.
+    r"""Draw a profile and its fit on linear and logarithmic axes, and the relative error of the fit
+    against the distance.
 
-    Three channels are drawn in red, green and blue; the single Gaussians of the fit, with the mean
-    weight of the channels, in gray. Each radius of a measurement is marked. The legend gives the
-    error (Eq. 4), and the energy of the fit divided by the energy of the profile, minus 1; "held"
-    if the two are equal up to rounding.
+    Three channels are drawn in red, green and blue. Each Gaussian of the fit, with its mean weight
+    over the channels, is drawn in gray. Radii of a measurement are marked. The legend shows the
+    error (Eq. 4), and the energy of the fit relative to that of the profile, minus 1, or "held" if
+    the two are equal up to rounding.
 
     **Arguments:**
 
     - `profile`: the reference, 1/mm^2.
-    - `gaussians`: the fit, with as many channels.
-    - `rule`: the rule of the fit. Radii before it begins are shaded, and do not count.
+    - `gaussians`: the fit, with the same number of channels.
+    - `rule`: the rule of the fit. Radii below its first are shaded and do not count.
     - `title`: title of the figure.
 
     **Returns:** a matplotlib `Figure`, which no window shows; `figure.savefig(path)` writes it.
@@ -59,7 +59,7 @@ def plot_fit(
     energy = np.asarray(gaussians.total_reflectance() / profile.total_reflectance() - 1)
     radii = np.asarray(r)
     ring = radii[:, None] ** 2 * reference
-    # Where hardly any light is, the line ends.
+    # End the line where there is hardly any light.
     relative = np.where(
         ring > _LEAST * ring.max(axis=0), fitted / np.maximum(reference, 1e-300) - 1, np.nan
     )
@@ -69,7 +69,7 @@ def plot_fit(
         [["linear", "log"], ["residual", "residual"]], height_ratios=(3, 2)
     ).values()
 
-    # What the fit is between few radii.
+    # Draw the fit between the few radii of a measurement.
     dense = r if len(r) > _FEW else jnp.geomspace(r[0], r[-1], _POINTS, dtype=r.dtype)
     between, of_fit = np.asarray(dense), np.asarray(gaussians(dense), np.float64)
     parts = gaussian(gaussians.variances[None], (dense * dense)[:, None])
@@ -87,7 +87,7 @@ def plot_fit(
         log.loglog(between, of_fit[:, channel], color=color, linewidth=1.2)
         residual.semilogx(radii, relative[:, channel], color=color, linewidth=1.2, marker=marker)
 
-    # The radius within which the widest channel keeps four fifths of the energy that is drawn.
+    # The radius that contains four fifths of the drawn energy in the widest channel.
     ring = np.cumsum(np.gradient(radii)[:, None] * radii[:, None] * reference, axis=0)
     core = radii[np.argmax(ring >= 0.8 * ring[-1], axis=0).max()]
     linear.set(xlabel="r (mm)", ylabel="r R(r) (1/mm)", xlim=(0, core), ylim=(0, None))
@@ -116,14 +116,15 @@ def plot_fit(
         most = 1.3 * max(float(np.nanmax(np.abs(relative[radii >= begin]))), 1e-3)
         residual.set_ylim(-most, most)
     for axis in (log.xaxis, residual.xaxis):
-        axis.set_minor_formatter(NullFormatter())  # within a decade their labels would overlap
+        axis.set_minor_formatter(NullFormatter())  # their labels would overlap within a decade
     figure.suptitle(title or "")
     return figure
 
 
 def _radii(profile: AbstractProfile) -> Float[Array, " radii"]:
-    """Those of a measured profile; else from a hundredth of the smallest length scale to where
-    every channel has fallen to the tail."""
+    """Return the radii of a measured profile; otherwise radii from a hundredth of the smallest
+    length scale to where every channel has fallen to the tail.
+    """
     measured = profile.known_radii()
     if measured is not None:
         return measured[0][measured[0] > 0]
@@ -140,7 +141,7 @@ def _colors(channels: int) -> Sequence[str]:
 
 
 def plot_error_by_count(by_count: ErrorByCount, *, title: str | None = None) -> Figure:
-    r"""Draw the error (Eq. 4) of each channel against the number of Gaussians, on a logarithmic
+    r"""Plot the error (Eq. 4) of each channel against the number of Gaussians, on a logarithmic
     axis.
 
     **Arguments:**
@@ -170,7 +171,7 @@ def plot_pictures(
     white: float | None = None,
     inches: float = 2.6,
 ) -> Figure:
-    r"""Draw a grid of pictures of linear light over black, encoded as sRGB.
+    r"""Draw a grid of linear-light pictures over black, encoded as sRGB.
 
     **Arguments:**
 
@@ -178,8 +179,8 @@ def plot_pictures(
       `Frame`.
     - `titles`: titles of the columns.
     - `names`: names of the rows.
-    - `white`: value that is shown as white. By default each row has its own exposure: of its values
-      above zero 0.5% are brighter than white.
+    - `white`: value that is shown as white. By default each row has its own exposure, with 0.5% of
+      the values above zero brighter than white.
     - `inches`: height of a picture.
 
     **Returns:** a matplotlib `Figure`, which no window shows; `figure.savefig(path)` writes it.
@@ -209,10 +210,10 @@ def plot_pictures(
 
 
 def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
-    r"""Draw each observed picture, the recovered one, and the difference.
+    r"""Draw each observed picture, the recovered picture, and their difference.
 
-    Pixels that do not count are gray. The difference is the mean of the channels, divided by the
-    picture's root mean square.
+    Pixels that do not count are gray. The difference is the mean over the channels, divided by the
+    root mean square of the picture.
 
     **Arguments:**
 
@@ -245,7 +246,7 @@ def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
 
 
 def _shown(picture: np.ndarray, bright: float) -> np.ndarray:
-    """Encode for the screen; three channels of any number."""
+    """Encode a picture for display, with three channels."""
     unknown = ~np.all(np.isfinite(picture), axis=-1, keepdims=True)
     gray = np.broadcast_to(np.mean(picture, axis=-1, keepdims=True), (*picture.shape[:2], 3))
     colors = picture if picture.shape[-1] == 3 else gray

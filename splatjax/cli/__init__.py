@@ -1,3 +1,3 @@
-"""The command line, `splatjax COMMAND`. It uses only the public interface."""
+"""The command line, `splatjax COMMAND`, which uses only the public interface."""
 
 from ._main import main as main

@@ -1,5 +1,5 @@
-"""`splatjax fit`: sums of Gaussians from optical coefficients; with --all, for many media in
-batches. Finished batches are kept, and are joined to one table at the end.
+"""`splatjax fit`: sums of Gaussians for optical coefficients; with --all, for many media in
+batches, which are kept and joined to one table at the end.
 """
 
 import shutil
@@ -30,11 +30,11 @@ from ._terminal import (
 )
 
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
-# Error that is noted, and ratio of the channels' widths that explains it.
+# Error above which a note is printed, and the ratio of channel widths that explains it.
 _LARGE, _APART = 0.05, 3.0
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
 _OF_ALL = {"medium", "count", "model", "g", "output", "all"}
-# Options that affect only one kind of input.
+# Options for only one kind of input.
 _OPTIONS = {
     _COEFFICIENTS: ("model", "photons", "g", "single_scattering"),
     _PROFILE: ("mm_per_unit",),
@@ -47,13 +47,13 @@ class Fit:
     """Fit a sum of Gaussians to a diffusion profile, and print it with its errors.
 
     The profile is that of a medium, of layers, of a measurement, or of a laser dot in a photograph.
-    The fit uses double precision. All channels share the variances. Weights are non-negative, and
-    their sum equals the total reflectance of the profile, so that the picture keeps its energy. The
-    total of a measured profile is unknown, so its weights are only non-negative.
+    The fit uses double precision. All channels share the variances. Weights are non-negative and
+    sum to the total reflectance of the profile, so that the picture keeps its energy. The total of
+    a measured profile is unknown, so its weights are only non-negative.
 
-    --model selects the profile of a medium: the photon beam with the total and the angles of light
-    transport; the dipole, which publications use; or light transport itself, by Monte Carlo
-    (docs/which_profile.md).
+    --model selects the profile of a medium: the photon beam, with the total and the angles of light
+    transport; the dipole, which most publications use; or Monte Carlo light transport. See
+    docs/which_profile.md.
 
     Examples: splatjax fit marble --count 6 --output marble.toml --plot marble.png
               splatjax fit media.csv --all --output fits.csv
@@ -62,7 +62,7 @@ class Fit:
     medium: Annotated[
         tyro.conf.Positional[str],
         tyro.conf.arg(
-            help="Name of a material (`splatjax materials`), or path: of a TOML file with a "
+            help="Name of a material (`splatjax materials`), or path of a TOML file with a "
             "[medium], [openpbr], [[layers]], [skin] or [burley], of a CSV file with radii and a "
             "column per channel, or of an EXR file with a linear photograph of a laser dot."
         ),
@@ -70,24 +70,24 @@ class Fit:
     #: Number of Gaussians.
     count: int = 6
     #: Largest error (Eq. 4) of any channel. The fit then uses the least number of Gaussians that
-    #: reaches it, up to 12, instead of --count.
+    #: reaches this error, up to 12, instead of --count.
     error: OptionalFloat = None
     #: Model of the profile of coefficients: photon-beam (default), dipole, better-dipole or
-    #: monte-carlo. Layers use the multipole, or monte-carlo.
+    #: monte-carlo. Layers use the multipole or monte-carlo.
     model: Annotated[
         _models.Model | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="")
     ] = None
-    #: Mean cosine of Henyey and Greenstein's phase function, for photon beams and Monte Carlo. By
+    #: Mean cosine of the Henyey-Greenstein phase function, for photon beams and Monte Carlo. By
     #: default the value in the file, or 0.
     g: OptionalFloat = None
     #: Number of photons for Monte Carlo.
     photons: int = 1_000_000
-    #: Keep light that scatters once as a separate term, and fit Gaussians to the rest, for photon
-    #: beams and Monte Carlo.
+    #: Keep light that is scattered once as a separate term, and fit Gaussians to the rest; for
+    #: photon beams and Monte Carlo.
     single_scattering: bool = False
     #: Unit of length of a CSV file, mm.
     mm_per_unit: float = 1.0
-    #: Size of a pixel of a photograph on the surface, mm.
+    #: Width of a pixel of a photograph on the surface, mm.
     mm_per_pixel: OptionalFloat = None
     #: Power that enters the material in a photograph, in W if the picture is in W/(mm^2 sr).
     power: float = 1.0
@@ -96,8 +96,8 @@ class Fit:
         tyro.conf.arg(
             help="Fit all media of a CSV file, with the columns sigma_a, sigma_s_prime "
             "(1/mm), eta, and optionally a name; --output is then a CSV file. Finished "
-            "batches are kept: after an interruption, run the same command again. If a "
-            "launcher has started several processes (docs/devices.md), they share the "
+            "batches are kept; after an interruption, run the same command again. If a "
+            "launcher starts several processes (docs/devices.md), they share the "
             "work."
         ),
     ] = False
@@ -126,8 +126,8 @@ class Fit:
             self._run_all() if self.all else self._run()
 
     def _run_all(self) -> None:
-        """Fit the media of a table, in batches that are kept in a folder until all exist; the
-        processes of a launcher share them.
+        """Fit the media of a table in batches that are kept in a folder until all exist. The
+        processes of a launcher share the batches.
         """
         if self.output is None:
             raise ValueError("--all needs --output, a CSV file for the fits")
@@ -165,7 +165,7 @@ class Fit:
             return
         try:
             tables = [sj.io.read_columns(part) for part in parts]
-        except FileNotFoundError:  # another process has joined them at the same time
+        except FileNotFoundError:  # another process joined the batches at the same time
             if not self.output.exists():
                 raise
             return
@@ -187,8 +187,8 @@ class Fit:
         if isinstance(coefficients, sj.Dipole):
             paths = format_numbers(1 / coefficients.medium.sigma_t_prime, ".3g")
             note(
-                f"{self.medium}: mean free path {paths} mm; the fit hardly weights the rows within "
-                "it, where tens of percent are usual"
+                f"{self.medium}: mean free path {paths} mm; the fit hardly weights smaller radii, "
+                "where errors of tens of percent are usual"
             )
         self._note_error(target, fitted)
         total = fitted.gaussians.total_reflectance()
@@ -209,7 +209,7 @@ class Fit:
             )
 
     def _note_error(self, target: _models.Reference, fitted: sj.fitting.FitResult) -> None:
-        """Note a large error, and its cause if the widths of channels differ too much."""
+        """Print a note about a large error, and whether different widths of channels cause it."""
         scales, count = target.profile.length_scale(), len(fitted.gaussians.variances)
         error, ratio = float(fitted.error.max()), float(scales.max() / scales.min())
         reason = (
@@ -225,7 +225,7 @@ class Fit:
             )
 
     def _target(self) -> tuple[_models.Coefficients | None, _models.Reference]:
-        """Read the input; return its coefficients, `None` if it is measured, and the profile to
+        """Read the input, and return its coefficients (`None` if it is measured) and the profile to
         fit. Raise `ValueError` for options without effect on this kind of input.
         """
         kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
@@ -293,7 +293,7 @@ class Fit:
     ) -> None:
         surface, source = dict[str, Any](), dict[str, Any]()
         if coefficients is not None:
-            # The index of a surface is that of the medium it bounds, unless the file gives it.
+            # The index of the surface is that of the medium, unless the file specifies it.
             is_layered = isinstance(coefficients, sj.LayeredMultipole)
             top = coefficients.top if is_layered else coefficients
             surface, source = sj.io.surface_and_source(self.medium)

@@ -1,5 +1,6 @@
-"""Parse the command line, run a command, and report an error in one line; and decide what a library
-leaves to the program: the cache of compiled code, the device, and the reuse of memory.
+"""Parse the command line, run a command, and report errors in one line. Also choose the settings
+that a library leaves to the program: the cache of compiled code, the device, and the reuse of
+memory.
 """
 
 import contextlib
@@ -42,9 +43,11 @@ Lengths are in mm.
 `splatjax COMMAND --help` explains a command. --debug adds the traceback to an error.
 `splatjax --version` prints the version."""
 _DEBUG = "--debug"
-# Of XLA: a single picture compiles in three quarters of the time, and renders a tenth slower.
+# Options of XLA, with which a picture compiles in three quarters of the time and renders a tenth
+# slower.
 _OF_ONE_PICTURE = {"xla_cpu_use_fusion_emitters": False}
-# Of glibc, from malloc.h: one arena, nothing mapped separately, nothing returned to the system.
+# Options of glibc (malloc.h): one arena, no separate mappings, and no memory returned to the
+# system.
 _MALLOPT = {"M_ARENA_MAX": (-8, 1), "M_MMAP_MAX": (-4, 0), "M_TRIM_THRESHOLD": (-1, 2**31 - 1)}
 
 
@@ -53,10 +56,10 @@ def main(args: Sequence[str] | None = None) -> int:
 
     **Arguments:**
 
-    - `args`: the words after `splatjax`; by default from the command line of the process.
+    - `args`: the words after `splatjax`, by default those of the command line.
 
     **Returns:** the exit status: 0 for success; 2 for invalid input and 1 for a fault of splatjax,
-    both with one line on stderr; 130 when interrupted; 141 when stdout is a closed pipe.
+    both with one line on stderr; 130 if interrupted; 141 if stdout is a closed pipe.
     """
     words = list(sys.argv[1:] if args is None else args)
     try:
@@ -69,11 +72,11 @@ def main(args: Sequence[str] | None = None) -> int:
             try:
                 command.run()
                 sys.stdout.flush()
-            except SystemExit:  # of rich, when it writes to a closed pipe
+            except SystemExit:  # raised by rich when it writes to a closed pipe
                 raise BrokenPipeError from None
         return 0
     except BrokenPipeError:
-        # Python would write once more when it ends.
+        # Python would write again when it exits.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except KeyboardInterrupt:
@@ -87,10 +90,11 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def parsed(words: list[str]) -> Any:
-    """Parse words into a command; raise `SystemExit` for help, for the version, and for words that
+    """Parse words into a command. Raise `SystemExit` for help, for the version, and for words that
     are not a command.
 
-    Only the command of the first word is parsed, so that help and errors are about it alone.
+    Only the command of the first word is parsed, so that help and errors are only about this
+    command.
     """
     name, *arguments = words or ["--help"]
     style = (tyro.conf.PositionalMetavarFromFieldName,)
@@ -113,18 +117,18 @@ def parsed(words: list[str]) -> Any:
 
 
 def _message(error: Exception) -> tuple[str, int]:
-    """Return one line about an error, and the exit status: 2 for what the user can fix, 1 for a
-    fault of splatjax.
+    """Return one line about an error, and the exit status: 2 for an error that the user can fix, 1
+    for a fault of splatjax.
     """
     text = str(error)
-    # The message is between a stack and advice to developers.
+    # The message is between a stack trace and advice for developers.
     if isinstance(error, eqx.EquinoxRuntimeError):
         text = text.rpartition("EquinoxRuntimeError: ")[2].partition("\n\n---")[0]
     line = " ".join(text.split())
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}", 2
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in line:
-        return "not enough memory is available; take fewer splats, or a smaller picture", 2
+        return "not enough memory is available; use fewer splats or a smaller picture", 2
     if isinstance(error, ValueError | OSError | eqx.EquinoxRuntimeError):
         return line or type(error).__name__, 2
     return (
@@ -135,15 +139,15 @@ def _message(error: Exception) -> tuple[str, int]:
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    """Print a warning for users in one line; print none for developers."""
+    """Print a warning for users in one line, and no warnings for developers."""
     if issubclass(category, UserWarning):
         note(" ".join(str(message).split()))
 
 
 def keep_freed_memory() -> None:
-    """Let the C library keep the memory of one picture for the next, where it is glibc.
+    """Let the C library, if it is glibc, keep the memory of one picture for the next.
 
-    Otherwise the system maps, and clears, the buffers of every picture again.
+    Otherwise the system maps and clears the buffers of every picture again.
     """
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
         for parameter, value in _MALLOPT.values():
@@ -151,14 +155,14 @@ def keep_freed_memory() -> None:
 
 
 def prepare_jax(compiler_options: Mapping[str, bool | str]) -> None:
-    """Cache slow parts of the start in the user's cache folder, and compute on the CPU, unless
-    environment variables specify otherwise.
+    """Enable the cache in the user's cache folder, and compute on the CPU, unless environment
+    variables specify otherwise.
 
-    JAX's own variables, `JAX_COMPILATION_CACHE_DIR`, `JAX_PLATFORMS` and others, take precedence;
+    JAX's own variables (`JAX_COMPILATION_CACHE_DIR`, `JAX_PLATFORMS` and others) take precedence.
     `XDG_CACHE_HOME` moves the cache folder.
     """
     if jax.config.jax_platforms is None:  # ty: ignore[missing-attribute]
         jax.config.update("jax_platforms", "cpu")
-    # Without the folder, everything is made and compiled each time.
+    # Without the folder, everything is computed and compiled each time.
     with contextlib.suppress(OSError):
         sj.cache.keep(compiler_options=compiler_options)

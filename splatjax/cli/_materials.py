@@ -1,5 +1,5 @@
-"""`splatjax materials` lists the library, `splatjax export` writes materials and scenes for other
-renderers, and `splatjax sample` converts a mesh with maps to splats.
+"""`splatjax materials`, which lists the library, `splatjax export`, which writes materials and
+scenes for other renderers, and `splatjax sample`, which converts a mesh with maps to splats.
 """
 
 import re
@@ -34,7 +34,7 @@ _SCENES = {
     ".usda": sj.io.save_usd,
     ".usdc": sj.io.save_usd,
 }
-_OPEN = 0.02  # least mean normal of an open surface; that of a closed one is zero
+_OPEN = 0.02  # least mean normal of an open surface; a closed surface has 0
 _ACROSS = 8  # pictures in a row of a sheet
 
 
@@ -42,7 +42,7 @@ _ACROSS = 8  # pictures in a row of a sheet
 class Materials:
     """List the materials of the library, or print one.
 
-    `splatjax render --material` takes their names, and so does `splatjax fit` if coefficients or
+    `splatjax render --material` accepts their names, and so does `splatjax fit` if coefficients or
     layers are known.
 
     Examples: splatjax materials marble > mine.toml
@@ -53,13 +53,13 @@ class Materials:
         tyro.conf.Positional[str | None],
         tyro.conf.arg(
             metavar="[MATERIAL]",
-            help="Print the file of this material (coefficients, source, Gaussians), as a "
-            "starting point for your own. Without it, list all materials.",
+            help="Print the file of this material (coefficients, source, Gaussians) as a "
+            "starting point for a new material. Default: list all materials.",
             help_behavior_hint="",
         ),
     ] = None
-    #: Also render each material on the built-in bust, 7 cm tall, in the studio, and write the
-    #: pictures to this sheet, PNG or JPEG.
+    #: Also render each material on the built-in bust, 7 cm tall, in the studio, and write all
+    #: pictures to this PNG or JPEG file.
     pictures: OptionalPath = None
 
     def run(self) -> None:
@@ -92,24 +92,24 @@ class Materials:
 class Export:
     """Write a material for other renderers as JSON or MaterialX, or a scene as glTF or USD.
 
-    JSON has the Gaussians of a material, with formula, unit and source of each entry: GPU Gems
-    weights, a kernel for separable subsurface scattering, Burley's d, the shape parameter of
-    Unity's HDRP, Blender's radius. MaterialX has an OpenPBR surface. glTF and USD have material,
-    body, camera and lights. USD needs usd-core, the extra `usd` of splatjax.
+    JSON contains the Gaussians of a material in several forms, each with formula, unit and source:
+    GPU Gems weights, a kernel for separable subsurface scattering, Burley's d, the shape parameter
+    of Unity's HDRP, and Blender's radius. MaterialX contains an OpenPBR surface. glTF and USD
+    contain material, body, camera and lights. USD needs usd-core, the extra `usd` of splatjax.
 
     Examples: splatjax export marble --output marble.mtlx --mm-per-unit 10
               splatjax export scene.toml --output scene.glb
     """
 
-    #: Name of a material (`splatjax materials`), or path of a TOML file with a [fit], or for
-    #: MaterialX with coefficients; for glTF and USD the TOML file of a scene, or a picture of
+    #: Name of a material (`splatjax materials`), or path of a TOML file with a [fit] (for
+    #: MaterialX, coefficients suffice); for glTF and USD, the TOML file of a scene or a picture of
     #: `splatjax render`.
     source: tyro.conf.Positional[str]
     #: JSON, MTLX, GLB, USD, USDA or USDC file to write.
     output: Path
-    #: Length of the unit of the other renderer's scene, mm; only for MaterialX.
+    #: Length of the other renderer's unit, mm; only for MaterialX.
     mm_per_unit: float = 1.0
-    #: Irradiance of 1 lux in the unit of the lights, only for glTF: 1/683, 0.00146, for Blender.
+    #: Irradiance of 1 lux in the unit of the lights; only for glTF. Blender uses 1/683, 0.00146.
     lux: float = 1.0
 
     def run(self) -> None:
@@ -137,9 +137,9 @@ class Export:
                 g = sj.io.load_mean_cosine(sj.io.material_of_scene(table))
             if mesh is None:
                 note(
-                    f"the body is a hexagon for each of its {scene.splats.count} splats, which are "
-                    "not closed, so that light cannot scatter below its surface in other "
-                    "renderers; give a scene whose [splats] has `mesh` in place of `file`"
+                    f"the body is a hexagon for each of its {scene.splats.count} splats, which do "
+                    "not form a closed surface, so other renderers cannot scatter light below it; "
+                    "give a scene whose [splats] has `mesh` instead of `file`"
                 )
             own = {"lux": self.lux} if suffix == ".glb" else {"g": g}
             save(self.output, scene, camera, mesh=mesh, **own)
@@ -155,10 +155,10 @@ class Export:
 
 
 def _with_coefficients(source: str) -> sj.Material:
-    """Load a material for OpenPBR, which needs no Gaussians if there are coefficients."""
+    """Load a material for OpenPBR, which does not need Gaussians if there are coefficients."""
     try:
         medium = sj.load_medium(source)
-    except ValueError:  # of Gaussians, layers or pigments
+    except ValueError:  # a material of Gaussians, layers or pigments
         return sj.load_material(source)
     surface: dict[str, Any] = {"eta": medium.eta[0]} | sj.io.surface_and_source(source)[0]
     unused = sj.SumOfGaussians([1.0], medium.eta[None])
@@ -186,14 +186,14 @@ def _row(name: str) -> tuple[str, ...]:
 
 
 def _picture(name: str) -> np.ndarray:
-    """Render a material on the bust, in its own color."""
+    """Render a material on the bust, in the color of the material."""
     view = Render(material=name, albedo=False, count=20_000, scale=0.2, width=120, height=120)
     return np.asarray(sj.render(*view.open()).beauty)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """Sample splats with maps from a mesh, and write them as PLY, in mm.
+    """Sample splats from a mesh with maps, and write them as PLY, in mm.
 
     The mesh is a GLB, glTF, OBJ, PLY, STL or OFF file.
 
@@ -203,7 +203,7 @@ class Sample:
 
     #: The file of the mesh.
     mesh: tyro.conf.Positional[Path]
-    #: Length of the file's unit in mm: 1000 for meters.
+    #: Length of the file's unit, mm; 1000 for meters.
     mm_per_unit: float
     #: The PLY file to write.
     output: Path
@@ -211,20 +211,19 @@ class Sample:
     count: int = 200_000
     #: Seed of the random positions.
     seed: int = 0
-    #: Place splats on a curved surface that follows the normals of the mesh, instead of on its flat
+    #: Place splats on a curved surface that follows the normals of the mesh, instead of on flat
     #: triangles.
     rounded: bool = True
     #: Upward axis of the file; splats have +y up.
     up: UpAxis = "y"
     #: Angle between triangles above which an edge is hard, degrees, if the file has no normals, or
-    #: normals that differ by more from their triangles.
+    #: normals that differ from their triangles by more than this.
     crease_angle: float = 40.0
     #: Map of the mesh's diffuse color, sRGB. By default the texture of the file, if any.
     albedo: OptionalPath = None
-    #: Gray map of factors on the material's specular strength.
+    #: Gray map of factors of the material's specular strength.
     specular: OptionalPath = None
-    #: Gray map: the fraction of the surface that consists of --second, from none (black) to all
-    #: (white).
+    #: Gray map of the fraction of --second in the surface, from 0 (black) to 1 (white).
     share: OptionalPath = None
     #: With --share, the material with which the splats will be rendered.
     material: Annotated[str, tyro.conf.arg(metavar="MATERIAL")] = "skin_light"
@@ -236,13 +235,13 @@ class Sample:
         bool | None,
         tyro.conf.arg(
             metavar="{True,False}",
-            help="Whether v = 0 is the lower edge of a map. By default as the format "
-            "prescribes: OBJ yes, glTF and GLB no. If the texture is upside down, give "
+            help="Whether v = 0 is the lower edge of a map. The format determines the default: "
+            "true for OBJ, false for glTF and GLB. If the texture is upside down, give "
             "the opposite.",
             help_behavior_hint="",
         ),
     ] = None
-    #: Remove the mesh below this height, in the file's unit.
+    #: Height, in the file's unit, below which the mesh is removed.
     crop_min_y: OptionalFloat = None
 
     def run(self) -> None:
@@ -276,8 +275,8 @@ class Sample:
         size, area = np.ptp(np.asarray(splats.centers), axis=0), float(splats.areas.sum())
         if np.linalg.norm(splats.areas @ splats.normals) > _OPEN * area:
             note(
-                f"{self.mesh}: its surface is open; near its rims too much light leaves, and as a "
-                "volume it cannot be exported; close the holes, or keep them out of the picture"
+                f"{self.mesh}: its surface is open; too much light leaves near its borders, and it "
+                "cannot be exported as a volume; close the holes, or keep them out of the picture"
             )
         note(
             f"{splats.count} splats on {area:.4g} mm^2, with "

@@ -1,5 +1,5 @@
-"""Fits of coefficients for `splatjax fit`: the models of `docs/which_profile.md` by name, fits of
-many media by one program for `--all`, and the report of a fit.
+"""Fits of coefficients for `splatjax fit`: models by name (`docs/which_profile.md`), fits of many
+media for `--all`, and the report of a fit.
 """
 
 from dataclasses import dataclass, replace
@@ -20,17 +20,17 @@ Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carl
 Coefficients: TypeAlias = (
     sj.Dipole | sj.LayeredMultipole | sj.scattering.Skin | sj.scattering.Burley
 )
-# Weights of the fit to a medium: the picture keeps its energy.
+# Weights of the fit to a medium, which conserve the energy of the picture.
 MEDIUM_WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 
 
 def model_by_name(model: Model | None, g: float) -> sj.fitting.AbstractModel:
-    """Return the model of a half space named by an option; by default, light transport.
+    """Return the model of a half space that an option names, by default light transport.
 
-    **Raises:** `ValueError` for a mean cosine that the model does not take.
+    **Raises:** `ValueError` for a mean cosine that the model does not support.
     """
     if g and model in ("dipole", "better-dipole"):
-        raise ValueError(f"--model {model} with --g {g} is not possible; take photon-beam")
+        raise ValueError(f"--model {model} with --g {g} is not possible; use photon-beam")
     if model == "better-dipole":
         return sj.fitting.DiffusionModel(sj.scattering.BetterDipole)
     return sj.fitting.DiffusionModel() if model == "dipole" else sj.fitting.TransportModel(g)
@@ -38,13 +38,13 @@ def model_by_name(model: Model | None, g: float) -> sj.fitting.AbstractModel:
 
 @dataclass(frozen=True)
 class Reference:
-    """A profile to be fitted, and the radii of the fit.
+    """A profile to fit, and the settings of the fit.
 
     **Attributes:**
 
-    - `single`: light that scatters once, if it is separate from the profile.
-    - `description`: description of a profile that coefficients alone do not define.
-    - `angles`: dependence of its light on the angles of entry and exit.
+    - `single`: light that is scattered once, if it is separate from the profile.
+    - `description`: describes a profile that coefficients alone do not define.
+    - `angles`: dependence of the light on the angles of entry and exit.
     - `weights`: the weights that the fit allows.
     """
 
@@ -64,25 +64,24 @@ def reference(
     single_scattering: bool,
     is_rgb: bool = True,
 ) -> Reference:
-    """Return the profile of a medium or of layers by a model.
+    """Compute the profile of a medium or of layers by a model.
 
     **Arguments:**
 
-    - `model`: `None` is the photon beam with the total of light transport, or the multipole of
-      layers.
+    - `model`: `None` is the photon beam with the total of light transport, or for layers the
+      multipole.
     - `g`: mean cosine of the phase function.
-    - `single_scattering`: whether light that scatters once is separated from the profile.
-    - `is_rgb`: whether the wavelengths of a skin become linear sRGB, under daylight.
+    - `single_scattering`: whether light that is scattered once is separated from the profile.
+    - `is_rgb`: whether the wavelengths of a skin are converted to linear sRGB, under daylight.
 
-    **Raises:** `ValueError` for options that the model, or a material with layers, does not
-    support.
+    **Raises:** `ValueError` for options that the model or a material with layers does not support.
     """
     is_burley = isinstance(coefficients, sj.scattering.Burley)
     if is_burley or isinstance(coefficients, sj.scattering.Skin):
         if model or g or single_scattering:
             raise ValueError(
-                "a [skin] is fitted by light transport in its layers, with the g of its table, and "
-                "a [burley] as it is; leave --model, --g and --single-scattering out"
+                "a [skin] is fitted by light transport in its layers with the g of its table, and "
+                "a [burley] directly; leave --model, --g and --single-scattering out"
             )
         if is_burley:
             return Reference(coefficients, sj.fitting.TransportModel.rule)
@@ -94,10 +93,10 @@ def reference(
     option = f"--model {model}{' with --single-scattering' if single_scattering else ''}"
     if (single_scattering or g) and model not in ("photon-beam", "monte-carlo"):
         option = option if single_scattering else f"{option} with --g {g}"
-        raise ValueError(f"{option} is not possible; take photon-beam or monte-carlo")
+        raise ValueError(f"{option} is not possible; use photon-beam or monte-carlo")
     if is_layered and (single_scattering or model not in ("dipole", "monte-carlo")):
         raise ValueError(
-            f"{option} is for a half space, and this material has layers; take --model dipole or "
+            f"{option} is for a half space, but this material has layers; use --model dipole or "
             "monte-carlo without --single-scattering"
         )
     if model == "monte-carlo":
@@ -121,7 +120,9 @@ def _by_model(model: sj.fitting.AbstractModel, optics: sj.Medium | sj.scattering
 
 
 def _without_single(target: Reference, medium: sj.Medium, g: float) -> Reference:
-    """Separate the light that scatters once from a profile, and the angles of the rest."""
+    """Separate the light that is scattered once from a profile, and compute the angles of the
+    rest.
+    """
     single, half_space = sj.SingleScattering(medium), sj.scattering.HalfSpace(medium, g)
     scattered_once = single.directional_albedo(jnp.asarray(half_space.cosines()))
     whole: Any = target.profile
@@ -136,7 +137,7 @@ def _without_single(target: Reference, medium: sj.Medium, g: float) -> Reference
 
 
 def _walked(coefficients: sj.Dipole | sj.LayeredMultipole, photons: int, g: float) -> Reference:
-    """Trace photons in single precision, which suffices; the fit uses double precision."""
+    """Compute the profile by Monte Carlo in single precision, which suffices."""
     is_layered = isinstance(coefficients, sj.LayeredMultipole)
     layers = coefficients.layers if is_layered else [sj.Layer(coefficients.medium, jnp.inf)]
     layers_32 = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), list(layers))
@@ -158,7 +159,7 @@ def _walked(coefficients: sj.Dipole | sj.LayeredMultipole, photons: int, g: floa
     )
 
 
-BATCH = 500  # media in one call
+BATCH = 500  # media per call
 
 
 @eqx.filter_jit
@@ -186,8 +187,9 @@ def _fit_each(
 def fit_batch(
     coefficients: np.ndarray, count: int, model: sj.fitting.AbstractModel
 ) -> dict[str, np.ndarray]:
-    """Fit a batch, and return its columns. A smaller batch is padded, so that one program serves
-    all. Fits start from the variances for dipoles, which are near the optima of the other models.
+    """Fit a batch of media, and return the columns of the table. A smaller batch is padded, so that
+    one program serves all. Fits start from the variances for dipoles, which are near the optima of
+    the other models.
     """
     length = len(coefficients)
     padded = np.pad(coefficients, ((0, BATCH - length), (0, 0)), mode="edge")
@@ -209,9 +211,8 @@ _DISTANCES = 7
 
 
 def print_fit(fitted: sj.fitting.FitResult, target: Reference) -> None:
-    """Print the Gaussians of a fit, their errors, and the relative error by distance, over the
-    radii of the fit at which the light of any channel, per logarithmic radius, is above a hundredth
-    of its peak.
+    """Print the Gaussians of a fit, their errors, and the relative error at radii of the fit where
+    the light of any channel, per logarithmic radius, is above a hundredth of its peak.
     """
     profile, rule = target.profile, target.rule
     nodes, weights = (np.asarray(values) for values in rule.radii(profile))

@@ -1,4 +1,4 @@
-"""`splatjax recover`: from pictures of a known shape to a material."""
+"""`splatjax recover`: a material from pictures of a known shape."""
 
 import functools
 import time
@@ -34,11 +34,11 @@ _COEFFICIENTS = ("sigma_a", "sigma_s_prime")
 
 @dataclass(frozen=True, kw_only=True)
 class Recover:
-    """Find the absorption and scattering of a material from pictures of a known shape.
+    """Recover the absorption and scattering of a material from pictures of a known shape.
 
-    The result has error bars, the combinations that the pictures do not determine, and the picture
-    to take next. A TOML file lists the pictures, each with its camera, its lights, and optionally
-    its noise and intensity:
+    The result includes error bars, the combinations that the pictures do not determine, and the
+    best picture to take next. A TOML file lists the pictures with their cameras and lights, and
+    optionally noise and intensity:
 
         [[pictures]]
         file = "left.exr"
@@ -55,14 +55,14 @@ class Recover:
     "disk" (center, direction, radius, radiance), "sphere" (center, radius, radiance) and
     "environment" (image).
 
-    The albedo of the splats is not used: the coefficients give all color. After an interruption,
-    run the same command again; it continues from the best medium so far.
+    The albedo of the splats is not used; the coefficients determine all color. After an
+    interruption, run the same command again to continue from the best medium so far.
 
     Example: splatjax recover head.ply pictures.toml --start skin1 marble --output mine.toml
     --report mine.png
     """
 
-    #: PLY file of splats, in mm (`splatjax sample` makes one).
+    #: PLY file of splats, in mm (`splatjax sample` writes one).
     splats: tyro.conf.Positional[Path]
     #: TOML file that lists the pictures.
     pictures: tyro.conf.Positional[Path]
@@ -70,11 +70,11 @@ class Recover:
         tuple[str, ...],
         tyro.conf.arg(
             metavar="MATERIAL [MATERIAL ...]",
-            help="Materials to start from, within a factor of three in both coefficients: "
-            "names, or paths of TOML files. The best result counts.",
+            help="Materials to start from, within a factor of three in both coefficients, as "
+            "names or paths of TOML files. The best result is kept.",
         ),
     ] = ("skin1", "marble")
-    #: Index of refraction, which is not fitted. By default the index of the first start.
+    #: Index of refraction, which is not fitted. By default that of the first start.
     eta: OptionalFloat = None
     #: TOML file to write the material to.
     output: Path = Path("recovered.toml")
@@ -86,13 +86,13 @@ class Recover:
     g: float = 0.0
     #: Number of Gaussians.
     count: int = 6
-    #: Reduce the weight of outliers: highlights, dust, effects outside of the model.
+    #: Reduce the weight of outliers, such as highlights, dust and effects outside the model.
     robust: bool = False
     #: Strength of the specular lobe, if the pictures show one.
     specular: float = 0.0
     #: Roughness of the specular lobe.
     roughness: float = 0.3
-    #: Report the picture to take next, among candidates with the camera of the first picture.
+    #: Report the best picture to take next, among candidates with the camera of the first picture.
     suggest: bool = True
 
     def run(self) -> None:
@@ -112,7 +112,7 @@ class Recover:
                 ),
             },
         )
-        model_by_name(self.model, self.g)  # reports faults before the pictures are read
+        model_by_name(self.model, self.g)  # raise errors before the pictures are read
         for name in self.start:
             sj.load_medium(name)
         with stage(f"reading {self.splats} and {self.pictures}"):
@@ -142,8 +142,8 @@ class Recover:
         }
         starts = self._starts(search, dependencies, observations[0].picture.shape[2])
         note(
-            f"not searched: the index of refraction, {float(starts[0].eta[0]):g} (--eta), and the "
-            f"specular lobe, of strength {self.specular:g} (--specular)"
+            f"not fitted: the index of refraction, {float(starts[0].eta[0]):g} (--eta), and the "
+            f"strength of the specular lobe, {self.specular:g} (--specular)"
         )
         begin = time.perf_counter()
 
@@ -154,7 +154,7 @@ class Recover:
                 sj.io.write_record(search, {"made of": dependencies, **values})
 
         gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, starts[0].eta.shape[0])))
-        message = "compiling, for a minute or two; kept for later runs"
+        message = "compiling for a minute or two; cached for later runs"
         with sj.cache.watched_compiling(functools.cache(functools.partial(note, message))):
             recovery = sj.inverse.recover(
                 observations,
@@ -176,7 +176,7 @@ class Recover:
             report("kept", recovery.medium)
             note(
                 f"{self.pictures}: the search did not converge, and this is its best round; "
-                "run the same command again to resume, or give nearer materials as --start"
+                "run the same command again to resume, or give closer materials as --start"
             )
         print(recovery.summary())
         if self.suggest:
@@ -192,14 +192,14 @@ class Recover:
             save_figure(plot_recovery(recovery, title=title), self.report)
 
     def _starts(self, search: Path, dependencies: dict[str, Any], channels: int) -> list[sj.Medium]:
-        """Return the media to start from: the best one of an interrupted search, if there was
+        """Return the media to start from, or the best medium of an interrupted search if there is
         one.
         """
         media = [sj.load_medium(name) for name in self.start]
         for name, medium in zip(self.start, media, strict=True):
             if medium.eta.shape[0] != channels:
                 raise ValueError(
-                    f"--start {name} has {medium.eta.shape[0]} channels, the pictures have "
+                    f"--start {name} has {medium.eta.shape[0]} channels, but the pictures have "
                     f"{channels}; give another material"
                 )
         eta = media[0].eta if self.eta is None else jnp.full_like(media[0].eta, self.eta)
@@ -208,7 +208,7 @@ class Recover:
             return starts
         record = sj.io.read_record(search)
         if record.get("made of") != dependencies:
-            note(f"{search}: belongs to another search, and is not used")
+            note(f"{search}: belongs to another search and is not used")
             return starts
         note(f"{search}: resuming an interrupted search")
         return [sj.Medium(*(jnp.asarray(record[name]) for name in _COEFFICIENTS), eta)]
@@ -223,7 +223,7 @@ class Recover:
         candidates = sj.inverse.default_candidates(splats, first.camera, first.picture.shape[2])
         with stage(f"evaluating {len(candidates)} pictures that could be taken next"):
             predictions = sj.inverse.next_pictures(recovery, splats, candidates)
-        print("predicted gain of one more picture, the best first:")
+        print("predicted gain of one more picture, best first:")
         print(*(f"  {prediction}" for prediction in predictions), sep="\n")
 
     def _save(self, recovery: sj.inverse.Recovery) -> None:

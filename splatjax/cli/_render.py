@@ -1,5 +1,5 @@
-"""`splatjax render` and `splatjax turntable`: a picture with all layers, or the frames of an
-animation, which resume after an interruption.
+"""`splatjax render`, which writes a picture with all layers, and `splatjax turntable`, which writes
+the frames of an animation and resumes after an interruption.
 """
 
 import functools
@@ -37,20 +37,20 @@ from ._terminal import (
 )
 from ._view import ViewOptions
 
-_LARGEST = 16_383  # pixels along a side of a WebP file
-_MOST_FRAMES = 10_000  # the most that four digits can number
+_LARGEST = 16_383  # largest side of a WebP file, pixels
+_MOST_FRAMES = 10_000  # numbered with four digits
 _NOT_IN_PICTURES = ("splats", "output", "fps", "quiet", "half", "camera_file", "camera_unit")
-_DIRECTIONS = 128  # number of shadow maps of an environment that turns about the body
+_DIRECTIONS = 128  # number of shadow maps of an environment that rotates about the body
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions(ViewOptions):
-    """Options for the contents of a picture's files."""
+    """Options for the contents of picture files."""
 
-    #: Background of the PNG, not of the EXR: black, transparent, or the environment.
+    #: Background of the PNG (not of the EXR): black, transparent, or the environment.
     background: Literal["black", "transparent", "environment"] = "black"
-    #: Light under which the PNG shows the color of a material of wavelengths: D65, A, FL11, or
-    #: another one of colour-science; None if the lights of the scene have spectra of their own.
+    #: Illuminant under which the PNG shows the color of a spectral material: D65, A, FL11, or
+    #: another name of colour-science; None if the lights of the scene have spectra.
     illuminant: str | None = "D65"
     #: Write the EXR in half precision, except for depth and position.
     half: bool = False
@@ -71,14 +71,14 @@ class PictureOptions(ViewOptions):
         scene: sj.Scene,
         camera: sj.Camera,
         settings: sj.RenderSettings,
-        count: int | None = None,  # of all splats, if the scene has a part of them
+        count: int | None = None,  # number of all splats, if the scene has only a part
     ) -> tuple[Path, Path]:
-        """Write the picture with all its layers, and the PNG file beside it; return both paths."""
+        """Write the picture with all its layers and the PNG file; return both paths."""
         material, lights = scene.material, scene.lights
         picture, shown = path.with_suffix(".png"), frame.beauty
         contents = scene_contents(self, settings, path.parent, material, lights, camera)
         variances = material.gaussians.variances.tolist()
-        # The sum of all layers belongs to no Gaussian.
+        # The sum of all layers does not belong to a Gaussian.
         widths = variances if len(frame.weights) == len(variances) else None
         sj.write_exr(
             path,
@@ -95,13 +95,13 @@ class PictureOptions(ViewOptions):
             shown = lights[0].behind(frame, camera)
         shown = sj.io.picture_to_rgb(np.asarray(shown), material.wavelengths, self.illuminant)
         if self.background == "transparent":
-            colors = np.repeat(shown, 3 // shown.shape[-1], axis=-1)  # for a scene in gray
+            colors = np.repeat(shown, 3 // shown.shape[-1], axis=-1)  # for a gray scene
             shown = np.concatenate([colors, np.asarray(frame.coverage)[..., None]], axis=-1)
         sj.write_png(picture, shown, exposure=self.exposure)
         return path, picture
 
     def manifest(self) -> dict[str, Any]:
-        """Return what the pictures depend on besides a scene's file: options, files, versions."""
+        """Return the options, files and versions that the pictures depend on."""
         versions = {"splatjax": sj.__version__, "jax": jax.__version__}
         if self.table is not None:
             return versions
@@ -118,26 +118,25 @@ class PictureOptions(ViewOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Render(PictureOptions):
-    """Render splats, the built-in bust, or a scene: an EXR file with every layer, and a PNG file.
+    """Render splats, the built-in bust, or a scene to an EXR file with all layers and a PNG file.
 
-    A scene is a TOML file of body, material, lights and camera, or a picture of this command, which
-    is rendered again.
+    A scene is a TOML file with body, material, lights and camera, or a picture of this command,
+    which is rendered again.
 
     The light is a studio, an --environment, or a single light with a weak fill. The camera looks at
-    the middle of the splats from a distance at which all of them are visible. Angles are in
-    degrees: azimuth turns about the vertical axis, 0 is the front (+z) and 90 the side of +x;
-    elevation is measured from the horizon. If the splats have albedo, the weights of the material
-    are divided by their sums, so that the albedo alone gives the color; with --no-albedo the
-    material gives it.
+    the center of the splats from a distance at which all splats are visible. Angles are in degrees:
+    azimuth turns about the vertical axis, with 0 in front (+z) and 90 at +x; elevation is measured
+    from the horizon. If the splats have an albedo, the weights of the material are divided by their
+    sums, so that the albedo alone determines the color; with --no-albedo, the material determines
+    the color.
 
     Examples: splatjax render head.ply --material skin --azimuth 30 --output head.exr
               splatjax render --material marble --no-albedo --output marble.exr
     """
 
-    #: The EXR file to write; the PNG file has the same name with another suffix.
+    #: The EXR file to write. The PNG file has the same name with another suffix.
     output: Path = Path("out.exr")
-    #: Number of splats to read at a time, for files that are larger than memory. 0 reads all at
-    #: once.
+    #: Number of splats to read at a time, for files larger than memory. 0 reads all at once.
     stream: int = 0
     camera_file: Annotated[
         str | None,
@@ -145,8 +144,8 @@ class Render(PictureOptions):
             name="camera",
             metavar="FILE[:NAME]",
             help="Camera from transforms.json, glTF, or a folder of COLMAP, instead of --azimuth, "
-            "--elevation and --fov; of several, by its name or its number from 0. The width of "
-            "the picture follows from its --height.",
+            "--elevation and --fov. Select one of several by its name or its number from 0. "
+            "--height determines the width of the picture.",
             help_behavior_hint="",
         ),
     ] = None
@@ -169,7 +168,7 @@ class Render(PictureOptions):
                 },
             )
         if self.camera_file is not None:
-            self.camera(tuple, self.azimuth)  # its file is read before anything is made
+            self.camera(tuple, self.azimuth)  # read the file before any computation
         if self.table is None and self.splats and self.stream:
             pictured = self._streamed(self.splats)
         else:
@@ -185,8 +184,8 @@ class Render(PictureOptions):
         return camera_of(self.camera_file, self.camera_unit, self.up, self.height, self.scale)
 
     def _drawn(self, scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings) -> sj.Frame:
-        # Sample the lights before the preview, which is drawn during the first compilation, so that
-        # no compilation is nested.
+        # Sample the lights before the preview is drawn during the first compilation, so that
+        # compilations are not nested.
         samples = [sample for light in scene.lights for sample in light.samples()]
         with preview(lambda side: rough_picture(scene, samples, camera, self.exposure, side)):
             with stage("planning"):
@@ -217,15 +216,15 @@ class Render(PictureOptions):
 class Turntable(PictureOptions):
     """Render the frames of an animation around splats, or the built-in bust.
 
-    Each frame is an EXR file with every layer and a PNG file; the animation turntable.webp plays in
+    Each frame is an EXR file with all layers and a PNG file; the animation turntable.webp plays in
     a browser. Frames start at --azimuth and the light's azimuth and continue in equal steps; a full
-    turn ends one step before its first frame, so that it can repeat. The splats are planned and the
-    program is compiled once for all frames. With --turn camera and no fill, the light below the
-    surface is computed once too; for an environment that turns, shadow maps are rendered once.
-    Existing frames are kept: after an interruption, run the same command again. A record in the
-    folder, turntable.json, prevents a mixture of frames with different options. If a launcher has
-    started several processes (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and
-    JAX_PROCESS_ID), they share the frames of one folder that all of them can access.
+    turn ends one step before its first frame, so that it can repeat. One plan and one compiled
+    program serve all frames. With --turn camera and no fill, the light below the surface is
+    computed only once; for a rotating environment, shadow maps are rendered only once. Existing
+    frames are kept; after an interruption, run the same command again. A record in the folder,
+    turntable.json, prevents mixing frames with different options. If a launcher starts several
+    processes (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID),
+    they share the frames of one folder that all can access.
 
     Example: splatjax turntable head.ply --material skin --frames 72 --output head
     """
@@ -245,14 +244,14 @@ class Turntable(PictureOptions):
     degrees: Annotated[
         float,
         tyro.conf.arg(
-            help="Total angle by which camera and light turn: to greater azimuths, or to "
-            "smaller ones if negative. An object seems to turn the other way."
+            help="Total angle by which camera and light turn, degrees; negative angles decrease "
+            "the azimuth. An object appears to turn the other way."
         ),
     ] = 360.0
     #: Frames per second of turntable.webp, from 0.1 to 60.
     fps: float = 24.0
 
-    table = None  # a scene's file has one camera
+    table = None  # a scene file has one camera
 
     def run(self) -> None:
         process = process_index_and_count()
@@ -293,7 +292,7 @@ class Turntable(PictureOptions):
         print(*written, sep="\n")
 
     def azimuths(self, frame: int) -> tuple[float, float]:
-        """Return the azimuths of camera and light."""
+        """Return the azimuths of the camera and the light in a frame."""
         turned = self.degrees * frame / self.frames
         return (
             self.azimuth + (0 if self.turn == "light" else turned),
@@ -301,7 +300,7 @@ class Turntable(PictureOptions):
         )
 
     def _prepare(self, paths: list[tuple[Path, Path]]) -> Callable[[int], None]:
-        """Load and plan; return the function that renders and writes frame i."""
+        """Load the scene, make a plan, and return the function that renders and writes frame i."""
         splats, material = self.load()
         settings, places = self.settings, [self.azimuths(i) for i in range(self.frames)]
         scenes = [sj.Scene(splats, self.lights(material, *place), material) for place in places]
@@ -310,12 +309,12 @@ class Turntable(PictureOptions):
         if keeps_shadows:
             even = functools.partial(replace, directions=sj.scene.even_directions(_DIRECTIONS))
             scenes = [replace(scene, lights=tuple(map(even, scene.lights))) for scene in scenes]
-        # One plan serves all frames, so that an interruption does not change any.
+        # One plan serves all frames, so that an interruption does not change them.
         with stage(f"planning {self.frames} frames"):
             plan = sj.make_plan(scenes, cameras, settings)
         light = None
         if self.turn == "camera" and (self.environment_name is not None or self.fill == 0):
-            # No light moves: passes 1 and 4 are the same in every frame.
+            # The lights do not move, so passes 1 and 4 are equal in all frames.
             with stage("computing the light at the splats"):
                 light = jax.block_until_ready(sj.illuminate(scenes[0], plan, settings))
         elif keeps_shadows:

@@ -1,5 +1,5 @@
-"""Scenes of the command line: cameras from files, the contents of scene files, and a rough picture
-of a scene.
+"""Scenes on the command line: cameras from files, contents of scene files, and a rough picture of a
+scene.
 """
 
 import functools
@@ -21,7 +21,7 @@ _note_once = functools.cache(note)
 
 
 def camera_of(source: str, mm_per_unit: float, up: str, height: int, scale: float) -> sj.Camera:
-    """Read a camera from FILE or FILE:NAME, for a picture of given height, and scale it with the
+    """Read a camera from FILE or FILE:NAME for a picture of a given height, and scale it with the
     body.
     """
     path, _, name = ("", "", "0") if Path(source).exists() else source.rpartition(":")
@@ -30,7 +30,9 @@ def camera_of(source: str, mm_per_unit: float, up: str, height: int, scale: floa
 
 
 def is_scene(path: Path) -> bool:
-    """Return whether a file is, by its suffix, a scene, or a picture whose manifest is a scene."""
+    """Return whether the suffix of a file is that of a scene, or of a picture whose manifest is a
+    scene.
+    """
     return path.suffix.lower() in (".toml", ".exr")
 
 
@@ -43,12 +45,12 @@ def scene_contents(
     camera: sj.Camera,
     images: list[str] | None = None,
 ) -> dict[str, Any]:
-    """Return the contents of a scene's file in a folder. The body and the images of the lights are
-    existing files, of options or of the scene's file that they name.
+    """Return the contents of a scene file in a folder, with references to the existing files of the
+    body and of the images of the lights.
 
     **Arguments:**
 
-    - `images`: an image for each light; by default the environment of the options.
+    - `images`: an image for each light, by default the environment of the options.
     """
     if options.table is None:
         old, images = Path(), images or [options.environment_name or ""] * len(lights)
@@ -71,16 +73,16 @@ def scene_contents(
 
 
 def identified(path: Path) -> str:
-    """Return the name of a file, and its fingerprint."""
+    """Return the name and the fingerprint of a file."""
     return f"{path.name}, {sj.io.fingerprint(path)}"
 
 
 def draw(
     scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings, plan: sj.Plan, light=None
 ) -> sj.Frame:
-    """Render, and wait for the picture; the arguments are those of `sj.render`.
+    """Render a picture, and wait for it. The arguments are those of `sj.render`.
 
-    **Raises:** `ValueError` when the plan's capacity is exceeded.
+    **Raises:** `ValueError` if the plan's capacity is exceeded.
     """
     frame = jax.block_until_ready(sj.render(scene, camera, settings, plan, light=light))
     if not frame.overflow <= 0:
@@ -92,36 +94,37 @@ def draw(
 
 
 def note_unresolved(frame: sj.Frame, scene: sj.Scene, kernel: Any, count: int) -> None:
-    """Note the layers that the splats do not resolve, and how many splats would resolve the widest
-    of them. The splats of the scene may be a part of the `count` splats of the frame.
+    """Print a note about layers that the splats do not resolve, and the number of splats that would
+    resolve the widest of them. The splats of the scene may be a part of the `count` splats of the
+    frame.
     """
     unresolved = np.asarray(frame.unresolved_fraction) > 0.5
     if not unresolved.any():
         return
     deviations = np.sqrt(scene.material.gaussians.variances)[unresolved]
     interval = np.asarray(kernel.interval(sj.diffusion.unevenness(scene.splats)))
-    # In the middle of the interval, in variance, half of a layer is resolved.
+    # Half of a layer is resolved if its variance is in the middle of the interval.
     needed = count * np.mean(scene.splats.areas) * np.mean(interval**2) / deviations[-1] ** 2
     widths = ", ".join(f"{width:.3g}" for width in deviations)
     _note_once(
         "unresolved, because they are narrower than the splats: Gaussians of standard deviations "
         f"{widths} mm; about {float(f'{needed:.2g}'):,.0f} splats of this body (--count) resolve "
-        f"the one of {deviations[-1]:.3g} mm"
+        f"that of {deviations[-1]:.3g} mm"
     )
 
 
 def rough_picture(
     scene: sj.Scene, samples: Sequence[Any], camera: sj.Camera, exposure: float, side: int
 ) -> list:
-    """Draw the centers of splats, matte and under samples of the lights, by NumPy alone, which
-    compiles nothing. The longer side has at most `side` pixels, fewer for few splats; the height is
+    """Draw the centers of splats as matte points under samples of the lights, by NumPy without
+    compilation. The longer side has at most `side` pixels, fewer for few splats, and the height is
     even. Return rows of red, green and blue up to 255.
     """
     scene, camera, lights = jax.device_get((scene, camera, samples))
-    # A part of millions of splats suffices.
+    # A subset of millions of splats suffices.
     splats = jax.tree.map(lambda leaf: leaf[:: 1 + len(leaf) // 2**19], scene.splats)
     lengths = np.asarray([camera.width, camera.height])
-    side = max(2, min(side, 0.5 * splats.count**0.5))  # so that few pixels have no splat
+    side = max(2, min(side, 0.5 * splats.count**0.5))  # so that few pixels lack a splat
     size = 2 * np.maximum(np.rint(side / 2 * lengths / lengths.max()), 1).astype(int)
     albedo = 1.0 if splats.albedo is None else splats.albedo
     color = (albedo * scene.material.gaussians.weights.sum(axis=0) / np.pi) * sum(
@@ -130,7 +133,7 @@ def rough_picture(
     )
     color = sj.io.picture_to_rgb(color, scene.material.wavelengths)
     local = (splats.centers - camera.position) @ camera.rotation.T
-    # Draw splats that face the camera from far to near: nearer ones cover farther ones.
+    # Draw splats that face the camera from far to near, so that nearer splats cover farther ones.
     order = np.argsort(-local[:, 2])
     order = order[np.sum(local * (splats.normals @ camera.rotation.T), axis=1)[order] < 0]
     middle = size * np.asarray(camera.principal_pixel) / lengths
@@ -142,7 +145,7 @@ def rough_picture(
 
 
 def direction_to(azimuth: float, elevation: float) -> np.ndarray:
-    """Return the unit vector from the middle towards a place on the sky, given in degrees."""
+    """Compute the unit vector towards an azimuth and elevation in degrees."""
     azimuth, elevation = math.radians(azimuth), math.radians(elevation)
     across = math.cos(elevation)
     return np.asarray([math.sin(azimuth) * across, math.sin(elevation), math.cos(azimuth) * across])

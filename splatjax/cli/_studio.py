@@ -1,4 +1,4 @@
-"""`splatjax studio`: turn and change a scene in the browser."""
+"""`splatjax studio`: view and change a scene in the browser."""
 
 import threading
 import tomllib
@@ -20,13 +20,12 @@ from ._view import ViewOptions
 
 @dataclass(frozen=True, kw_only=True)
 class Studio(ViewOptions):
-    """Open a page in the browser on which splats, the built-in bust, or a scene can be turned and
-    changed.
+    """Open a page in the browser to view and change splats, the built-in bust, or a scene.
 
-    It needs viser, the extra `studio` of splatjax. The command prints the address of the page;
+    The command needs viser, the extra `studio` of splatjax. It prints the address of the page;
     Ctrl-C ends it. Sliders change the coefficients of a material that has a [medium]. The page
-    saves pictures, the material, and the scene, which `splatjax render` and the studio take. A
-    scene is a TOML file of body, material, lights and camera, or a picture of `splatjax render`.
+    saves pictures, the material, and the scene, which `splatjax render` and the studio can open. A
+    scene is a TOML file with body, material, lights and camera, or a picture of `splatjax render`.
 
     Examples: splatjax studio --material marble --no-albedo --scale 0.2
               splatjax studio scene.toml
@@ -36,11 +35,11 @@ class Studio(ViewOptions):
     output: Path = Path("studio")
     #: Number of splats of the built-in bust.
     count: int = 100_000
-    #: TOML file that lists pictures, as for `splatjax recover`: the page takes the camera and the
-    #: lights of the first, and offers to recover the material.
+    #: TOML file that lists pictures, as for `splatjax recover`. The page uses the camera and the
+    #: lights of the first picture, and offers to recover the material.
     pictures: OptionalPath = None
-    #: The address to listen on. On any address except 127.0.0.1, other computers that reach it can
-    #: change the scene and save files.
+    #: The address to listen on. With any address except 127.0.0.1, other computers can change the
+    #: scene and save files.
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     #: The port to listen on; if it is in use, the next free port is used.
     port: int = 8080
@@ -56,7 +55,7 @@ class Studio(ViewOptions):
             page.close()
 
     def page(self) -> Page:
-        """Open the page of the scene, and return it."""
+        """Open the page of the scene and return it."""
         observations, images = [], None
         if self.pictures is not None:
             observations, images = sj.io.read_observations(self.pictures), _images(self.pictures)
@@ -86,7 +85,7 @@ class Studio(ViewOptions):
 
 
 def _images(pictures: Path) -> list[str]:
-    """List the images of the lights of the first of some pictures."""
+    """List the images of the lights of the first picture in a file."""
     lights = tomllib.loads(pictures.read_text())["pictures"][0]["lights"]
     images = [light.get("image", "") for light in lights]
     return [name if name in sj.io.ENVIRONMENTS else str(pictures.parent / name) for name in images]

@@ -1,8 +1,8 @@
-"""Common parts of the commands: types of options for the help; checks of options and outputs at the
-start; messages on stderr, with results on stdout; and long commands that write many files, which
-several processes can share and the same command resumes.
+"""Common parts of the commands: types of options for the help, checks of options and outputs,
+messages on stderr, results on stdout, and resumable commands that write many files and that several
+processes can share.
 
-Explanations of more than a line are in `help`, because line breaks in docstrings are kept.
+Multi-line explanations are in `help`, because the help keeps line breaks of docstrings.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ import splatjax as sj
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 UpAxis = Literal["y", "z"]
-# By field of a command: whether its value is valid, and the requirement.
+# For each field of a command, whether its value is valid, and the requirement.
 Rules = dict[str, tuple[bool, str]]
 # Suffixes of figures.
 FIGURES = (".png", ".pdf", ".svg")
@@ -32,7 +32,7 @@ CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def option_name(field: str) -> str:
-    """Return the option of a field of a command: `light_azimuth` is `--light-azimuth`."""
+    """Return the option for a field of a command; `light_azimuth` becomes `--light-azimuth`."""
     return f"--{field.replace('_', '-')}"
 
 
@@ -46,18 +46,20 @@ def check_options(command: Any, rules: Rules) -> None:
 
 
 def check_unused(command: Any, names: Container[str], reason: str) -> None:
-    """Raise `ValueError` for the first of some options that is given, and would have no effect."""
+    """Raise `ValueError` for the first of the named options that is given but would have no
+    effect.
+    """
     for field in fields(command):
         value = getattr(command, field.name)
         if field.name in names and field.default not in (value, MISSING):
             raise ValueError(
-                f"{option_name(field.name)} is {value}, and {reason}; leave the option out"
+                f"{option_name(field.name)} is {value}, but {reason}; leave the option out"
             )
 
 
 def check_output(path: Path | None, suffixes: tuple[str, ...]) -> None:
-    """Raise `ValueError` for a name with another suffix or an existing folder of this name, and
-    `FileNotFoundError` for a missing folder.
+    """Raise `ValueError` for an output with another suffix or with the name of a folder, and
+    `FileNotFoundError` if its folder is missing.
     """
     if path is None:
         return
@@ -75,7 +77,7 @@ def check_folder(path: Path) -> None:
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure of matplotlib, completely or not at all, and print its path."""
+    """Write a matplotlib figure atomically, and print its path."""
     with sj.io.atomic_path(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:].lower())
     print(path)
@@ -88,10 +90,10 @@ def note(message: str) -> None:
 
 @contextlib.contextmanager
 def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
-    """Report a stage of the work, and afterwards its time.
+    """Report a stage of the work, and its duration when it ends.
 
-    Yields a function that takes the number of finished steps, of a total, and the name of the stage
-    if it changes. If stderr is not a terminal, it prints a line at most once a second.
+    Yield a function that takes the number of finished steps and, if it changes, the name of the
+    stage. If stderr is not a terminal, the function prints a line at most once a second.
     """
     begin = last = time.perf_counter()
     first = begin, total
@@ -100,7 +102,7 @@ def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
         def report(done: int, title: str = title) -> None:
             nonlocal first, last
             now = time.perf_counter()
-            # Before the first step of a task, programs are compiled.
+            # Programs are compiled before the first step of a stage.
             first = first if done > first[1] else (now, done)
             remaining = (now - first[0]) / max(done - first[1], 1) * (total - done)
             line = f"{title}: {done} of {total}" + (
@@ -116,13 +118,13 @@ def stage(title: str, total: int = 0) -> Generator[Callable[..., None]]:
 
 
 def preview(draw: Callable[[int], list]) -> contextlib.AbstractContextManager[None]:
-    """Show a small picture when the first compilation starts, once, if stderr is a terminal with
-    colors. If all programs are cached, the requested picture is ready just as soon.
+    """Show a small picture when the first compilation starts, if stderr is a terminal with colors.
+    If all programs are cached, no preview is needed.
 
     **Arguments:**
 
-    - `draw`: computes the picture from the largest number of pixels of a side: an even number of
-      rows of red, green and blue up to 255.
+    - `draw`: computes the picture with a given largest number of pixels per side, as an even number
+      of rows of red, green and blue up to 255.
     """
     return sj.cache.watched_compiling(functools.cache(lambda: _show(draw)))
 
@@ -136,22 +138,22 @@ def _show(draw: Callable[[int], list]) -> None:
         or not CONSOLE.file.isatty()
     ):
         return
-    note("a preview, without scattering, shadows and gloss; the picture is being compiled:")
-    side = min(64, CONSOLE.width, 2 * CONSOLE.height - 8)  # a character shows two pixels
+    note("a preview without scattering, shadows and gloss, while the picture is being compiled:")
+    side = min(64, CONSOLE.width, 2 * CONSOLE.height - 8)  # one character shows two pixels
     colors = [[f"rgb({red},{green},{blue})" for red, green, blue in row] for row in draw(side)]
     for above, below in zip(colors[::2], colors[1::2], strict=True):
         CONSOLE.print("".join(f"[{a} on {b}]▀[/]" for a, b in zip(above, below, strict=True)))
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:
-    """Print rows on stdout, their columns aligned."""
+    """Print rows on stdout with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
         print("  ".join(cells).rstrip())
 
 
-# Variables with the number of processes of a launcher; the first that is set is used.
+# Environment variables of launchers with the number of processes; the first that is set is used.
 _COUNTS = "JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"
 
 
@@ -165,27 +167,27 @@ def complete(
     name: str,
     what: str,
 ) -> Sequence[int]:
-    """Make this process's share of the missing items. All processes first agree on the missing
-    ones.
+    """Make this process's share of the missing items. All processes first agree on which items are
+    missing.
 
     **Arguments:**
 
-    - `process`: from `process_index_and_count`, called before any computation.
+    - `process`: result of `process_index_and_count`, which must precede any computation.
     - `record_path`: path of the record, in the folder of the files.
-    - `record`: the settings on which the files depend.
+    - `record`: the settings that the files depend on.
     - `items`: the files of each item.
     - `prepare`: called if an item is missing; returns the function that makes item i.
     - `name`: name of the items, for messages.
-    - `what`: the name of the work, for the message.
+    - `what`: description of the work, for messages.
 
-    **Returns:** all items, or those of this process if others are still at work.
+    **Returns:** all items, or those of this process if other processes are still working.
 
-    **Raises:** `ValueError` if the folder contains files of other settings.
+    **Raises:** `ValueError` if the folder contains files made with other settings.
     """
     _check_record(record_path, record, items)
     missing, folder = _missing(items), record_path.parent
     if len(missing) < len(items):
-        note(f"{len(items) - len(missing)} of {len(items)} {name} exist already, and are kept")
+        note(f"{len(items) - len(missing)} of {len(items)} {name} already exist and are kept")
     index, processes = process
     share = missing[index::processes]
     if share:
@@ -198,13 +200,13 @@ def complete(
                     make(i)
                     report(number)
         except (KeyboardInterrupt, OSError):
-            note(f"the {name} in {folder} are complete; run the same command again to continue")
+            note(f"finished {name} in {folder} are kept; run the same command again to continue")
             raise
     pending = _missing(items)
     if pending and folder.exists():
         note(
-            f"other processes still compute {len(pending)} {name}; the last of them joins all, or "
-            "run the same command again"
+            f"other processes are still computing {len(pending)} {name}; the last process joins "
+            "all, or run the same command again"
         )
     return share if pending else range(len(items))
 
@@ -225,18 +227,20 @@ def _check_record(path: Path, record: Mapping[str, Any], items: Sequence[tuple[P
         if before.get(name) != record.get(name)
     ]
     if changes:
-        raise ValueError(f"{path}: the files beside it differ: {'; '.join(changes)}; {remedy}")
+        raise ValueError(f"{path}: the settings changed: {'; '.join(changes)}; {remedy}")
 
 
 def process_index_and_count() -> tuple[int, int]:
-    """Wait for all processes of a launcher; return the index of this process and their number.
+    """Wait for all processes of a launcher, and return the index of this process and the number of
+    processes.
 
-    JAX detects SLURM and Open MPI; elsewhere `JAX_COORDINATOR_ADDRESS`, `JAX_NUM_PROCESSES` and
-    `JAX_PROCESS_ID` specify them. Afterwards each process continues alone: a failure of one does
-    not stop the others. Call it before any computation.
+    JAX detects SLURM and Open MPI; for other launchers, `JAX_COORDINATOR_ADDRESS`,
+    `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID` specify the processes. Afterwards each process
+    continues alone, so a failure of one does not stop the others. Call this function before any
+    computation.
 
-    **Raises:** `ValueError` if the environment specifies several processes without the index of
-    this one.
+    **Raises:** `ValueError` if the environment specifies several processes but not the index of
+    this process.
     """
     counts = [os.environ[name] for name in _COUNTS if name in os.environ]
     if not counts or counts[0] in ("0", "1"):
@@ -258,5 +262,5 @@ def process_index_and_count() -> tuple[int, int]:
 
 
 def _number(variable: str) -> int | None:
-    """Return the number in an environment variable, `None` if it is not set."""
+    """Return the number in an environment variable, or `None` if it is not set."""
     return int(os.environ[variable]) if variable in os.environ else None

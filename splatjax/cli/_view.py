@@ -1,4 +1,4 @@
-"""Options that the commands for pictures and the studio share: splats, camera and lights."""
+"""Options shared by the commands for pictures and the studio: splats, camera and lights."""
 
 import functools
 import math
@@ -26,12 +26,12 @@ from ._terminal import (
     stage,
 )
 
-# Degrees: the fill is beside the camera, on the side away from the light.
+# Degrees. The fill is beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
 _WHITE = 0.995  # least reflectance of a material that counts as white
-# Options of the single light, with their defaults if another of them is given.
+# Options of the single light, and their defaults if another of them is given.
 _SINGLE_LIGHT = {"light_azimuth": -20.0, "light_elevation": 30.0, "fill": 0.1}
-# Options that are given beside a scene's file.
+# Options that are allowed with a scene file.
 _BESIDE_SCENES = {
     *("splats", "output", "background", "exposure", "illuminant", "half", "quiet", "host", "port")
 }
@@ -39,9 +39,9 @@ _BESIDE_SCENES = {
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    """Splats of one material, a camera that sees all of them, and their light."""
+    """Splats of one material, a camera that shows all of them, and lights."""
 
-    #: PLY file of splats, in mm (`splatjax sample` makes one). Without it, the built-in bust.
+    #: PLY file of splats, in mm (`splatjax sample` writes one). Default: the built-in bust.
     splats: Annotated[
         tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[SPLATS]", help_behavior_hint="")
     ] = None
@@ -53,53 +53,53 @@ class ViewOptions:
     width: int = 512
     #: Height of the picture, pixels.
     height: int = 512
-    #: Azimuth of the camera around the middle of the splats.
+    #: Azimuth of the camera around the center of the splats, degrees.
     azimuth: float = 25.0
-    #: Elevation of the camera, between -90 and 90, both excluded.
+    #: Elevation of the camera, degrees, between -90 and 90, both excluded.
     elevation: float = 0.0
-    #: Vertical field of view.
+    #: Vertical field of view, degrees.
     fov: float = 25.0
-    #: Azimuth of a single light that replaces the studio; beyond 90, the light is behind the body.
+    #: Azimuth of a single light that replaces the studio, degrees; beyond 90 it is behind the body.
     #: Default with another option of the single light: -20.
     light_azimuth: OptionalFloat = None
-    #: Elevation of the single light. Default with another option of the single light: 30.
+    #: Elevation of the single light, degrees. Default with another option of the single light: 30.
     light_elevation: OptionalFloat = None
-    #: Strength of a light without shadows beside the camera, relative to the single light. Default
+    #: Strength of a shadowless fill light beside the camera, relative to the single light. Default
     #: with another option of the single light: 0.1.
     fill: OptionalFloat = None
-    #: Latitude-longitude map of linear radiance, instead of single lights: an EXR or HDR file, or
-    #: the name of a built-in one (studio, overcast, sun). Without any light option, the studio.
+    #: Latitude-longitude map of linear radiance that replaces single lights: an EXR or HDR file, or
+    #: the name of a built-in map (studio, overcast, sun). Default without single lights: studio.
     environment: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     #: Rotation of the environment about the vertical axis, degrees; at 0 the middle of the map is
-    #: the front (+z).
+    #: in front (+z).
     environment_rotation: float = 0.0
-    #: Exposure of the PNG, in stops: each doubles its brightness. The EXR does not depend on it.
+    #: Exposure of the PNG in stops; each stop doubles the brightness. The EXR is not affected.
     exposure: float = 0.0
-    #: Let light spread below the surface. Without scattering it leaves where it enters.
+    #: Let light spread below the surface. Without scattering, light leaves where it enters.
     scattering: bool = True
-    #: Model of the light below the surface: the profile of a flat surface (clusters); the same in
-    #: less time, with only the sum of the layers in the EXR (exitance); or the diffusion equation
-    #: in the closed body, from the coefficients of the material (shape).
+    #: Model of the light below the surface: the profile of a flat surface (clusters); the same
+    #: faster, with only the sum of the layers in the EXR (exitance); or the diffusion equation in a
+    #: closed body, with the coefficients of the material (shape).
     diffusion: Literal["clusters", "exitance", "shape"] = "clusters"
-    #: Number of times that light may leave the body and enter it again: 1 or 2 brighten folds.
+    #: Number of times that light may leave the body and enter it again; 1 or 2 brighten folds.
     bounces: int = 0
-    #: Use the maps of the splats (for the bust, skin). Without them only the material is visible.
+    #: Use the maps of the splats (on the bust, skin). Without maps, only the material is visible.
     albedo: bool = True
     #: Number of splats of the built-in bust.
     count: int = 200_000
-    #: Size of the body: at 0.2 the bust is 7 cm tall, and light travels five times as far relative
-    #: to it.
+    #: Scale of the body: at 0.2 the bust is 7 cm tall, and light travels five times as far relative
+    #: to its size.
     scale: float = 1.0
     #: Upward axis of the PLY file.
     up: UpAxis = "y"
-    #: Print only the files that are written, and errors.
+    #: Print only written files and errors.
     quiet: bool = False
 
-    illuminant = "D65"  # an option of pictures
+    illuminant = "D65"  # an option of pictures only
 
     def check(self, more_rules: Rules | None = None) -> None:
-        """Raise `ValueError` for options that break a rule, for a material that a PNG file cannot
-        show, and for too little memory.
+        """Raise `ValueError` for invalid options, for a material that a PNG file cannot show, and
+        for too little memory.
         """
         finite, positive = "be a finite number", "be 1 or more"
         azimuth, elevation, fill = self.single_light
@@ -144,7 +144,7 @@ class ViewOptions:
         check_options(self, rules | (more_rules or {}))
         # Raise an error for an unknown illuminant.
         sj.io.picture_to_rgb(np.zeros(material.channels), material.wavelengths, self.illuminant)
-        _ = self._environment  # its file is read before anything is made
+        _ = self._environment  # read the file before any computation
         count = 0 if self.splats else self.count
         check_memory(
             f"--width {self.width} --height {self.height}{f' --count {count}' if count else ''}",
@@ -154,7 +154,7 @@ class ViewOptions:
 
     @property
     def single_light(self) -> tuple[float, ...]:
-        """Return azimuth and elevation of the single light, and the strength of its fill."""
+        """Return the azimuth and elevation of the single light, and the strength of the fill."""
         return tuple(
             usual if (chosen := getattr(self, name)) is None else chosen
             for name, usual in _SINGLE_LIGHT.items()
@@ -162,7 +162,7 @@ class ViewOptions:
 
     @property
     def environment_name(self) -> str | None:
-        """Return the environment, by default the studio; `None` for single lights."""
+        """Return the name of the environment, by default the studio; `None` for single lights."""
         is_lit = any(getattr(self, name) is not None for name in _SINGLE_LIGHT)
         return self.environment or (None if is_lit else "studio")
 
@@ -188,7 +188,7 @@ class ViewOptions:
 
     @functools.cached_property
     def table(self) -> Any:
-        """Return the contents of the file that describes the whole scene, `None` without one."""
+        """Return the contents of a file that describes the whole scene, or `None`."""
         if self.splats is None or not is_scene(self.splats):
             return None
         reason = f"{self.splats} describes the whole scene (change it there)"
@@ -201,8 +201,8 @@ class ViewOptions:
         return self.material if self.table is None else sj.io.material_of_scene(self.table)
 
     def open(self) -> tuple[sj.Scene, sj.Camera, sj.RenderSettings]:
-        """Return scene, camera and settings: those of the scene's file, or of the options, with a
-        camera that sees all of the splats.
+        """Return scene, camera and settings of a scene file, or of the options with a camera that
+        shows all splats.
         """
         if self.table is not None:
             with stage(f"loading {self.splats}"):
@@ -213,7 +213,7 @@ class ViewOptions:
         return sj.Scene(splats, lights, material), camera, self.settings
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
-        """Return the splats, and the material with which they are rendered."""
+        """Return the splats and the material for rendering them."""
         with stage(
             f"reading {self.splats}" if self.splats else f"making the bust of {self.count} splats"
         ):
@@ -233,7 +233,7 @@ class ViewOptions:
                 ),
                 "albedo": (
                     material.wavelengths is None or splats.albedo is None,
-                    f"be left out (--no-albedo), because {self.material} has wavelengths in place "
+                    f"be left out (--no-albedo), because {self.material} has wavelengths instead "
                     "of red, green and blue",
                 ),
             },
@@ -248,27 +248,26 @@ class ViewOptions:
                 )
         elif is_white:
             note(
-                f"{self.material} has no color of its own, and the splats no albedo, so the body "
+                f"{self.material} has no color, and the splats have no albedo, so the body "
                 "is white; give --material skin_light, skin1 or marble (`splatjax materials` "
                 "lists more), or splats with albedo"
             )
-        if material.channels == 1:  # the same weights for red, green and blue
+        if material.channels == 1:  # equal weights for red, green and blue
             tiled = jax.tree.map(lambda leaf: jnp.tile(leaf, 3) if leaf.ndim else leaf, material)
             gaussians = replace(tiled.gaussians, variances=material.gaussians.variances)
             material = replace(tiled, gaussians=gaussians, wavelengths=None)
         return material if self.scattering else material.opaque()
 
     def adjusted(self, splats: sj.Splats) -> sj.Splats:
-        """Return splats at the scale of the options, with or without their maps."""
+        """Scale splats and keep or remove their maps, as the options specify."""
         splats = splats if self.scale == 1 else splats.scaled(self.scale)
         return splats if self.albedo else splats.without_maps()
 
     def lights(
         self, material: sj.Material, azimuth: float, light_azimuth: float
     ) -> tuple[sj.scene.AbstractLight, ...]:
-        """Return the light and the fill, in the channels of a material, or the environment, which
-        turns with the light. The fill is always on the same side of the camera, whose azimuth is
-        given.
+        """Return the single light and the fill, in the channels of a material, or the environment,
+        which turns with the light. The fill is always on the same side of the camera.
         """
         first_azimuth, elevation, fill = self.single_light
         if self._environment is not None:
@@ -276,7 +275,7 @@ class ViewOptions:
             image, is_rgb = self._environment.image, material.wavelengths is None
             image = image if is_rgb else image.mean(axis=-1, keepdims=True)
             return (sj.EnvironmentLight(image, rotation),)
-        # Under the first light, a white diffuser that faces it has radiance 1.
+        # A white diffuser that faces the first light has radiance 1.
         irradiance = np.full(material.channels, np.pi)
         light = sj.DirectionalLight(-direction_to(light_azimuth, elevation), irradiance)
         side = math.copysign(_FILL_SIDE, math.remainder(self.azimuth - first_azimuth, 360))
@@ -287,7 +286,7 @@ class ViewOptions:
 
     def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         """Place a camera at an azimuth so that the bounding sphere of the splats, given in parts,
-        just fits the narrower side of the picture.
+        just fits the shorter side of the picture.
         """
         bodies = (np.asarray(part.centers) for part in parts())
         corners = [bound(body, axis=0) for body in bodies for bound in (np.min, np.max)]

@@ -1,4 +1,4 @@
-"""Fits of sums of Gaussians to a profile, and the number of Gaussians that it needs."""
+"""Fits of sums of Gaussians to a profile, and the number of Gaussians that a fit needs."""
 
 import equinox as eqx
 import jax
@@ -31,18 +31,18 @@ class ErrorByCount(eqx.Module):
 
     **Attributes:**
 
-    - `error`: error of the best sums of 1, 2, ... Gaussians.
+    - `error`: errors of the best sums of 1, 2, ... Gaussians.
     - `variances`: variances of these sums, mm^2, ascending, padded with infinity. With
-      `VariancesPerChannel`, one set for each channel.
+      `VariancesPerChannel`, each channel has its own.
     """
 
     error: Float[Array, "counts channels"]
     variances: Float[Array, "*channels counts gaussians"]
 
     def least(self, error: float) -> int:
-        r"""Find the least number of Gaussians with which no channel exceeds an error.
+        r"""Find the least number of Gaussians for which no channel exceeds an error.
 
-        **Raises:** `ValueError` if no number suffices, or inside `jit`, because the answer depends
+        **Raises:** `ValueError` if no number suffices, and inside `jit`, because the result depends
         on values.
         """
         require(
@@ -58,7 +58,7 @@ class ErrorByCount(eqx.Module):
         return int(np.argmax(worst <= error)) + 1
 
     def start(self, count: int) -> GivenVariances:
-        """Return the start for a fit of `count` Gaussians that completes this search."""
+        """Return the start for a fit of `count` Gaussians that refines this result."""
         return GivenVariances(self.variances[..., count - 1, :count])
 
 
@@ -73,14 +73,14 @@ def error_by_count(
 ) -> ErrorByCount:
     r"""Find the best sums of 1, 2, ... Gaussians in one search, and the error of each.
 
-    One compilation serves all counts. The sums of squares equal those of the best fits to about
+    All counts share one compilation. The sums of squares equal those of the best fits to about
     1e-5.
 
     **Arguments:** as for `fit_gaussians`.
 
     - `max_count`: number of Gaussians, at least 1.
 
-    **Returns:** an `ErrorByCount`, which has no derivative.
+    **Returns:** an `ErrorByCount`. It is not differentiable.
 
     **Raises:** `ValueError` as `fit_gaussians` does.
     """
@@ -107,7 +107,7 @@ class LeastCount(eqx.Module):
 
     **Attributes:**
 
-    - `error`: Eq. 4 that no channel may exceed, positive.
+    - `error`: the largest error (Eq. 4) allowed in any channel, positive.
     - `max_count`: largest number of Gaussians to try.
     """
 
@@ -130,16 +130,15 @@ class FitResult(eqx.Module):
 
     - `gaussians`: the fitted sum, variances ascending. With `VariancesPerChannel` it has a leading
       axis of channels: variances `[channels, gaussians]`, weights `[channels, gaussians, 1]`.
-    - `error`: Eq. 4 of each channel.
-    - `energy_error`: sum of the weights divided by the profile's total reflectance, minus 1; 0 for
-      a fixed sum.
+    - `error`: relative error of each channel (Eq. 4).
+    - `energy_error`: sum of the weights divided by the profile's total reflectance, minus 1; 0 with
+      `FixedTotalReflectance`.
     - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
-    - `covariance`: how well the profile determines the parameters, in the Gauss-Newton
-      approximation: a change `d` of the parameters with `d @ inv(covariance) @ d <= 1` at most
-      doubles Eq. 3. The parameters are the variances, then the weights of the first channel, of the
-      second, and so on; with `VariancesPerChannel`, there is one matrix for each channel. For error
-      bars of a measured profile with equal, independent noise at `N` radii, divide it by `N` minus
-      the number of parameters.
+    - `covariance`: uncertainty of the parameters in the Gauss-Newton approximation: a change `d` of
+      the parameters with `d @ inv(covariance) @ d <= 1` at most doubles Eq. 3. The parameters are
+      the variances, then the weights channel by channel; with `VariancesPerChannel`, there is one
+      matrix per channel. For error bars of a measured profile with equal, independent noise at `N`
+      radii, divide the matrix by `N` minus the number of parameters.
     """
 
     gaussians: SumOfGaussians
@@ -149,9 +148,9 @@ class FitResult(eqx.Module):
     covariance: Float[Array, "*channels parameters parameters"]
 
     def table(self) -> list[tuple[str, str]]:
-        """Return the Gaussians and their errors as rows of a name and one number per channel; the
-        first row is the heading. With `VariancesPerChannel`, the Gaussians are listed channel by
-        channel. An energy error that rounds to 0 has no row.
+        """Return the Gaussians and their errors as rows of a name and one number per channel, after
+        a heading. With `VariancesPerChannel`, the Gaussians are listed channel by channel. An
+        energy error that rounds to 0 is omitted.
         """
         weights = self.gaussians.weights.reshape(-1, self.gaussians.channels)
         names = ", ".join(channel_names(len(self.error)))
@@ -184,36 +183,36 @@ def fit_gaussians(
 ) -> FitResult:
     r"""Fit a sum of Gaussians to a profile: minimize Eq. 3 over variances and weights.
 
-    Variable projection: for given variances the best weights are the solution of a linear problem,
-    and Levenberg and Marquardt's method searches the logarithms of the variances. By default the
-    search builds up from one Gaussian: each further one is tried in every gap between the variances
-    of the previous best fit and beyond both ends, and the best result is kept. The fit is compiled
-    once for each count and kind of profile.
+    The method is variable projection: for given variances the best weights solve a linear problem,
+    and the Levenberg-Marquardt method searches the logarithms of the variances. By default the
+    search starts with one Gaussian and adds one at a time: the new Gaussian is tried in every gap
+    between the variances of the best fit so far and beyond both ends, and the best result is kept.
+    The fit is compiled once per count and kind of profile.
 
-    The result is differentiable in every parameter of the profile, by the implicit function theorem
-    with the full Hessian of Eq. 3, in forward and reverse mode, to first order. The precision
-    follows the profile. In float32, errors below about 1e-5 are only rounding errors; a search that
-    gets there counts as converged.
+    The result is differentiable in every parameter of the profile, in forward and reverse mode, to
+    first order. Derivatives use the implicit function theorem with the full Hessian of Eq. 3. The
+    precision is that of the profile. In float32, errors below about 1e-5 are rounding errors; a
+    search that reaches them counts as converged.
 
     **Arguments:**
 
     - `profile`: 1/mm^2; the integral of `r R(r)^2` must exist. Differentiable.
-    - `count`: number of Gaussians, at least 1; or `LeastCount(error)`, the least number that
-      reaches the error.
+    - `count`: number of Gaussians, at least 1; or `LeastCount(error)` for the least number that
+      reaches an error.
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
-    - `weights`: `FreeWeights()` (default); `FixedTotalReflectance()`, which keeps the energy; or
-      `NonNegativeWeights(...)`, either of these without negative weights.
-    - `start`: variances near those of the best fit, `GivenVariances(...)`, for a single fast
-      search; it requires a fixed count. By default, fits with fewer Gaussians provide the start.
+    - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, which conserves the energy,
+      or `NonNegativeWeights(among)`, which also excludes negative weights.
+    - `start`: `GivenVariances(...)` near those of the best fit, for a single fast search; requires
+      a fixed count. By default, fits with fewer Gaussians provide the start.
     - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for
       a profile with standard errors.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.
 
-    **Returns:** a `FitResult`; `error` and `weights` do not depend on the unit of length.
+    **Returns:** a `FitResult`. Its `error` and weights do not depend on the unit of length.
 
     **Raises:** `ValueError` for a count below 1, for an error that no count reaches, for a `start`
-    without a count, and for a profile that is infinite at the origin unless the rule starts beyond
-    it (`L2_QUADRATURE.beyond`); an error with the message of `result` if `throw`.
+    without a fixed count, and for a profile that is infinite at the origin unless the rule starts
+    beyond it (`L2_QUADRATURE.beyond`); an error with the message of `result` if `throw`.
 
     **Source:** Kim et al. 2010, Eq. 3; variable projection: Golub and Pereyra 1973.
     """
@@ -226,7 +225,7 @@ def fit_gaussians(
         by_count = error_by_count(
             profile, count.max_count, spread=spread, weights=weights, rule=rule
         )
-        # Finishing a fit of shared variances may move error from one channel to another.
+        # The final refinement of shared variances may move error from one channel to another.
         for trial in range(by_count.least(count.error), count.max_count + 1):
             fitted = _fit_compiled(profile, trial, spread, weights, rule, by_count.start(trial))
             if float(jnp.max(fitted.error)) <= count.error:
@@ -269,23 +268,22 @@ def fit_weights(
     weights: AbstractWeights = FreeWeights(),
     rule: AbstractRadialRule = L2_QUADRATURE,
 ) -> SumOfGaussians:
-    r"""Fit the weights of Gaussians of given variances to a profile: minimize Eq. 3 over the
+    r"""Fit the weights of Gaussians with given variances to a profile: minimize Eq. 3 over the
     weights.
 
-    It needs no search, and is fast. With variances that increase by a factor of 3 and cover the
-    widths of many media, the dipole of each of these media is fitted with an error (Eq. 4) of about
-    0.2%; with a factor of 2, of 0.002%. One set of rendered layers therefore serves them all.
+    The fit is linear and fast. If the variances increase by a factor of 3 and cover the widths of
+    many media, the dipole of each medium is fitted with an error (Eq. 4) of about 0.2%; with a
+    factor of 2, the error is 0.002%. One set of rendered layers therefore serves all these media.
 
     **Arguments:**
 
     - `profile`: 1/mm^2. Differentiable, in forward and reverse mode.
     - `variances`: mm^2, positive, all different. Derivatives treat them as constants.
-    - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, or `NonNegativeWeights(...)`,
-      either of these without negative weights.
+    - `weights`: as for `fit_gaussians`.
     - `rule`: radii of the integral, in length scales of the profile.
 
-    **Returns:** the Gaussians, in the profile's precision. With the variances of a fit, the weights
-    equal the weights of the fit.
+    **Returns:** the Gaussians, in the precision of the profile. With the variances of a fit, the
+    weights are those of the fit.
 
     **Raises:** `ValueError` for a profile that is infinite at the origin unless the rule starts
     beyond it.

@@ -1,5 +1,5 @@
-"""Models of light in a medium: its profile, the quadrature of the fit, and the dependence on
-angles; and fits of optical coefficients to a measured profile.
+"""Models that compute profiles and angular laws from media, and fits of optical coefficients to a
+measured profile.
 """
 
 import abc
@@ -41,9 +41,8 @@ class AbstractModel(eqx.Module):
 
     **Attributes:** (of the class)
 
-    - `rule`: the quadrature of a fit to its profiles.
-    - `description`: a description of its profile, for files; `None` if coefficients alone define
-      the profile.
+    - `rule`: the quadrature for fits to its profiles.
+    - `description`: describes the profile in files; `None` if the coefficients alone define it.
     """
 
     rule: ClassVar[AbstractRadialRule] = L2_QUADRATURE
@@ -51,15 +50,18 @@ class AbstractModel(eqx.Module):
 
     @abc.abstractmethod
     def profile(self, medium: Any) -> AbstractProfile:
-        """Compute the profile of a medium; `SkinModel` takes a `Skin`. Differentiable."""
+        """Compute the profile of a medium, or for `SkinModel` of a `Skin`. Differentiable."""
 
     def angles(self, medium: Any) -> AngularLaw | None:
-        """Compute the dependence of the light on the angles of entry and exit; `None` for none."""
+        """Compute the dependence of light on the angles of entry and exit; `None` if there is
+        none.
+        """
         return None
 
 
 class DiffusionModel(AbstractModel):
-    r"""A profile in closed form: `Dipole`, as in publications, or `BetterDipole`.
+    r"""A model with a closed-form profile: `Dipole`, which most publications use, or
+    `BetterDipole`.
 
     **Attributes:**
 
@@ -73,8 +75,8 @@ class DiffusionModel(AbstractModel):
 
 
 class TransportModel(AbstractModel):
-    r"""The default model: the photon beam, with the total reflectance and the angular dependence of
-    light transport (`HalfSpace`).
+    r"""The default model: the photon beam profile, with the total reflectance and the angular law
+    of light transport (`HalfSpace`).
 
         model = TransportModel(g=0.8)
         weights = NonNegativeWeights(FixedTotalReflectance())
@@ -82,12 +84,12 @@ class TransportModel(AbstractModel):
         material = Material(fitted.gaussians, eta=1.3, angles=model.angles(medium))
 
     `rule` starts at half a mean free path, because splats hardly resolve smaller radii. It weights
-    radii by their fifth power, so that the fit is right deep in a shadow.
+    radii by their fifth power, so that the fit is accurate deep inside a shadow.
 
     **Attributes:**
 
-    - `g`: mean cosine of the phase function; one for all channels, or one for each. Differentiable;
-      jitted functions are recompiled for each new Python number, but only once for arrays.
+    - `g`: mean cosine of the phase function, one number or one per channel. Differentiable. Give an
+      array to avoid recompiling jitted functions for each new number.
     """
 
     g: float | tuple[float, ...] | Float[Array, "..."] = 0.0
@@ -106,8 +108,8 @@ class TransportModel(AbstractModel):
 
 
 class SkinModel(AbstractModel):
-    r"""Skin computed from its pigments: profile and angles by light transport, in red, green and
-    blue.
+    r"""A model of skin, computed from its pigments: profile and angular law by light transport, in
+    red, green and blue.
 
         skin = Skin(melanin=0.03)
         model = SkinModel(io.spectrum_to_rgb(skin.wavelengths))
@@ -136,19 +138,19 @@ class SkinModel(AbstractModel):
 def weight_factors(
     gaussians: SumOfGaussians, other: AbstractProfile
 ) -> Float[Array, "gaussians channels"]:
-    """Fit factors that turn the weights of one material into those of another.
+    """Fit factors that convert the weights of one material to those of another.
 
         factors = weight_factors(light.gaussians, dark.gaussians)
         splats = replace(splats, weights=1 + share[:, None, None] * (factors - 1))
 
-    The variances stay the same, so both materials can be rendered in one picture: `Splats.weights`
-    is 1 where the body consists of the first material, and `factors` where it consists of the
-    second. The second keeps its total reflectance, and no weight becomes negative.
+    The variances are unchanged, so one picture can show both materials: `Splats.weights` is 1 where
+    the body consists of the first material, and `factors` where it consists of the second. The
+    total reflectance of the second is exact, and no weight is negative.
 
-    **Arguments:** concrete arrays, so call it outside of `jit` and `grad`.
+    **Arguments:** (concrete arrays: call the function outside of `jit` and `grad`)
 
-    - `gaussians`: the Gaussians of the first material. A weight of 0 stays 0, so take the material
-      with the wider profile.
+    - `gaussians`: the Gaussians of the first material. A weight of 0 stays 0, so choose the
+      material with the wider profile.
     - `other`: the profile of the second material, 1/mm^2.
 
     **Returns:** one factor for each Gaussian and channel.
@@ -180,10 +182,10 @@ class MediumFit(eqx.Module):
     **Attributes:**
 
     - `medium`: the most likely medium.
-    - `covariance`: covariance of the logarithms of `sigma_a` and `sigma_s_prime`, per channel: its
+    - `covariance`: covariance of the logarithms of `sigma_a` and `sigma_s_prime` per channel; its
       diagonal contains the squared relative errors.
-    - `chi_squared`: sum of the squares of residuals divided by deviations, per degree of freedom:
-      about 1 if model and deviations are right. If it is larger, multiply the error bars by its
+    - `chi_squared`: sum of squared residuals, in units of the deviations, per degree of freedom. It
+      is about 1 if model and deviations are right; if it is larger, multiply the error bars by its
       square root.
     - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
     """
@@ -203,26 +205,27 @@ def fit_medium(
     count: int = 6,
     throw: bool = True,
 ) -> MediumFit:
-    r"""Fit absorption and scattering to a measured profile: weighted least squares on its samples.
+    r"""Fit absorption and scattering to the samples of a measured profile by weighted least
+    squares.
 
-    The model is the one used for pictures: a sum of Gaussians is fitted to the profile of the
-    coefficients, and the variance of the beam is added to each Gaussian. It is differentiated as a
-    whole. Channels are independent. Use double precision.
+    The profile of the coefficients is replaced by its sum of Gaussians, as in pictures, and the
+    variance of the beam is added to each Gaussian. The fit of the Gaussians is differentiated too.
+    Channels are independent. Use double precision.
 
     **Arguments:**
 
-    - `measured`: the profile with its scale, exitance per unit power entering, 1/mm^2, and with the
-      standard errors of its samples, positive.
-    - `start`: start of the search, within a factor of about ten; its `eta` is assumed known.
-    - `beam_variance`: variance of the beam that made the dot, per axis, mm^2.
+    - `measured`: exitance per unit power entering, 1/mm^2, on an absolute scale, with positive
+      standard errors.
+    - `start`: start of the search, within a factor of about ten of the result; its `eta` is kept.
+    - `beam_variance`: variance of the laser beam per axis, mm^2.
     - `model`: computes the profile of a medium.
     - `count`: number of Gaussians.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.
 
     **Returns:** a `MediumFit`.
 
-    **Raises:** `ValueError` for deviations that are missing or not positive, and for channels that
-    do not match; an error with the message of `result` if `throw`.
+    **Raises:** `ValueError` for deviations that are missing or not positive, and for unequal
+    numbers of channels; an error with the message of `result` if `throw`.
     """
     channels = measured.values.shape[1]
     require(

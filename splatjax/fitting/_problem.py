@@ -1,5 +1,5 @@
-"""The errors that a fit minimizes (Eq. 3) and reports (Eq. 4), and the fit as a function of the
-logarithms of the variances: a linear solve eliminates the weights (variable projection).
+"""The errors that a fit minimizes (Eq. 3) and reports (Eq. 4), and Eq. 3 as a function of the log
+variances, with the weights eliminated by a linear solve (variable projection).
 """
 
 import equinox as eqx
@@ -18,7 +18,9 @@ from ._weights import AbstractWeights, invert_moving
 def norm_radii(
     profile: AbstractProfile, rule: AbstractRadialRule
 ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
-    """Compute radii and weights for integrals of `r R^2`; raise if the integral does not exist."""
+    """Compute radii and weights for integrals of `r R^2`; raise `ValueError` if the integral
+    diverges.
+    """
     require(
         not (profile.singular and rule.reaches_origin),
         f"{type(profile).__name__} diverges like 1/r, so the integral of r R^2 from 0 (Eq. 3) "
@@ -38,7 +40,7 @@ def squared_error(
     **Arguments:**
 
     - `profile`: the reference, 1/mm^2. Differentiable.
-    - `gaussians`: a sum with as many channels. Differentiable.
+    - `gaussians`: a sum of Gaussians with the same number of channels. Differentiable.
     - `rule`: radii of the integral, in length scales of `profile`.
 
     **Returns:** [channels], 1/mm^2, at least 0.
@@ -60,7 +62,7 @@ def relative_error(
     r"""Compute the relative error of a fit: the root of Eq. 3 divided by the root of the integral
     of `r R^2` (Eq. 4).
 
-    It depends mainly on the core of a profile, and little on its tail; for the energy, see
+    The error depends mainly on the core of a profile and little on its tail. For the energy, see
     `FitResult.energy_error`.
 
     **Arguments:** as for `squared_error`. Differentiable where the fit is not perfect.
@@ -78,8 +80,8 @@ def relative_error(
 
 
 class Expansion(eqx.Module):
-    r"""The sum of squared residuals around a point, with the best weights everywhere (after Golub
-    and Pereyra).
+    r"""The expansion of the sum of squared residuals about a point, with the best weights at every
+    point (after Golub and Pereyra).
 
     **Attributes:**
 
@@ -96,12 +98,12 @@ class Expansion(eqx.Module):
 
 
 class FitProblem(eqx.Module):
-    r"""Eq. 3 of all channels that share their variances, each divided by its norm, at the nodes of
-    a radial rule.
+    r"""Eq. 3 for the channels that share their variances, divided by the norm of each channel and
+    discretized by a radial rule.
 
-    Variances are in units of the square of one length, the geometric mean of the `scales` of the
-    channels, so that results do not depend on the unit of length. Differentiable in `target` and
-    `total`; nodes and scales are constants.
+    Variances are in units of a squared length, the geometric mean of the `scales` of the channels,
+    so results do not depend on the unit of length. Differentiable in `target` and `total`; nodes
+    and scales are constants.
     """
 
     squared_radii: Float[Array, "*batch channels nodes"]
@@ -114,14 +116,16 @@ class FitProblem(eqx.Module):
 
     @property
     def squared_unit(self) -> Float[Array, ""]:
-        """The unit of variances, mm^2."""
+        """Return the unit of the variances, mm^2."""
         return jnp.exp(2 * jnp.mean(jnp.log(self.scales)))
 
     def variances(self, log_variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
         return jnp.exp(log_variances) * self.squared_unit
 
     def log_variances(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
-        """Compute the logarithms of given variances, mm^2; derivatives treat them as constants."""
+        """Compute the log variances of variances in mm^2; they are constants for
+        differentiation.
+        """
         variances = jax.lax.stop_gradient(variances).astype(self.target.dtype)
         return jnp.log(variances / self.squared_unit)
 
@@ -135,12 +139,12 @@ class FitProblem(eqx.Module):
         Float[Array, "channels gaussians gaussians"],
         Float[Array, "channels nodes"],
     ]:
-        """Find the best coefficients of each channel; return the basis, the coefficients, their
+        """Find the best coefficients of each channel, and return the basis, the coefficients, their
         response and the residuals. Inactive Gaussians have coefficient 0.
         """
         variances = self.variances(log_variances)
         energies = self.energies(variances)
-        # The Gaussians at the nodes, each scaled to a unit norm (in closed form).
+        # The Gaussians at the nodes, scaled to unit norm in closed form.
         basis = gaussian(variances[None, None], self.squared_radii[..., None])
         basis = basis * energies[None, None] * self.root_weights[..., None]
 
@@ -158,8 +162,8 @@ class FitProblem(eqx.Module):
         log_variances: Float[Array, " gaussians"],
         active: Bool[Array, " gaussians"] | None = None,
     ) -> Float[Array, "channels nodes"]:
-        """Compute the residuals of the best weights; the sum of their squares in a channel is the
-        square of its error (Eq. 4).
+        """Compute the residuals of the best weights. The sum of their squares over a channel is its
+        squared error (Eq. 4).
         """
         return self.solve(log_variances, active)[-1]
 
@@ -171,8 +175,7 @@ class FitProblem(eqx.Module):
         """Compute the sum of squared residuals and its derivatives in closed form."""
         basis, coefficients, response, residuals = self.solve(log_variances, active)
         slopes, curved, moved = self._slopes(log_variances, basis, coefficients, response)
-        # The derivative of the best coefficients; the first term alone is the derivative for zero
-        # residuals.
+        # The derivative of the best coefficients; the first term alone is that for zero residuals.
         along = jnp.einsum("cnk,cn->ck", slopes, residuals)
         follow = moved + response * along[:, None, :]
         steep = slopes * coefficients[:, None, :]
@@ -192,7 +195,7 @@ class FitProblem(eqx.Module):
         self, log_variances: Float[Array, " gaussians"]
     ) -> tuple[SumOfGaussians, Float[Array, " channels"], Float[Array, "parameters parameters"]]:
         """Compute the Gaussians of an optimum, the error (Eq. 4) of each channel, and the
-        covariance that `FitResult` describes.
+        covariance (see `FitResult`).
         """
         basis, coefficients, response, residuals = self.solve(log_variances)
         squared = jnp.sum(residuals * residuals, axis=1)
@@ -216,8 +219,8 @@ class FitProblem(eqx.Module):
         return SumOfGaussians(variances, (coefficients * scale).T), jnp.sqrt(squared), covariance
 
     def _slopes(self, log_variances, basis, coefficients, response):
-        """Compute the first and second derivative of the basis at fixed weights, and the derivative
-        of the coefficients without residuals.
+        """Compute the first and second derivatives of the basis at fixed weights, and the
+        derivative of the coefficients for zero residuals.
         """
         variances = self.variances(log_variances)[None, None]
         growth = 0.5 * self.squared_radii[..., None] / variances - 1

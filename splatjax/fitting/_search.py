@@ -1,5 +1,5 @@
-"""The search for the best variances: starts, Newton's method for the last steps, and the derivative
-of the optimum.
+"""The search for the best variances: starts, descent, the last steps by Newton's method, and the
+derivative of the optimum.
 """
 
 import abc
@@ -19,67 +19,69 @@ from splatjax.scattering import Medium
 from ._problem import Expansion, FitProblem
 from ._weights import NormalEquations, invert_moving
 
-# Range of the log variances (in squared length scales) from which a single Gaussian starts.
+# Range of log variances (in squared length scales) from which a single Gaussian starts.
 _FIRST = (-3.0, 4.0)
 
-# Distance in log variance at which a Gaussian starts outside the previous ones; neighbors are 1.4
-# to 2.2 apart.
+# Distance in log variance at which a Gaussian starts beyond the others; neighbors are 1.4 to 2.2
+# apart.
 _OUTWARD = 1.5
 
 _TOLERANCE = 1e-3
-# Enough to compare the starts, and for Newton's method to converge from the best one.
+# Accurate enough to compare starts, and for Newton's method to converge from the best end.
 _STEPS = 64
 
 # A fit has converged if a Gauss-Newton step would lower the sum of squares by less than this
 # fraction of it,
 _GAIN = 1e-6
 
-# or by less than the square of this many units of rounding of the profile's norm, because the
-# precision allows no more.
+# or by less than the square of this many rounding units of the profile's norm, the limit of the
+# precision.
 _FLOOR = 100.0
 
 _NEWTON_STEPS = 32
-# A step in log variance below this many units of rounding counts as zero.
+# A step in log variance below this many rounding units counts as zero.
 _STEP = 10.0
 
 
 @record
 class GivenVariances(eqx.Module):
-    r"""The start of a search from the variances of a fit of a similar profile.
+    r"""The start of a search: the variances of a fit to a similar profile.
 
-    It needs one descent, and finds the nearest optimum.
+    The search is one descent, to the nearest optimum.
 
     **Attributes:**
 
-    - `variances`: mm^2, positive: one for each Gaussian, or, for channels with separate variances,
-      a row for each channel.
+    - `variances`: mm^2, positive, one per Gaussian; with `VariancesPerChannel`, one row per
+      channel.
     """
 
     variances: Float[Array, "*channels gaussians"] = eqx.field(converter=numbers)
 
     def search(self, problem: FitProblem, count: int) -> Float[Array, " gaussians"]:
-        """Find nearly optimal log variances, ascending, of a problem in JAX's default precision."""
+        """Find nearly optimal log variances, ascending. The problem is in JAX's default
+        precision.
+        """
         require(
             self.variances.shape == (count,),
-            f"GivenVariances.variances must be {count}, one for each Gaussian and shared by the "
-            f"channels; got {list(self.variances.shape)}",
+            f"GivenVariances.variances must have {count} entries, one for each Gaussian; "
+            f"got shape {list(self.variances.shape)}",
         )
         return jnp.sort(_descend(problem, problem.log_variances(self.variances), None)[0])
 
 
 class DipoleStarts(eqx.Module):
-    r"""A table of the variances of the best fits to dipoles, per channel, by reduced albedo and
-    index of refraction.
+    r"""A table of the variances of the best fits to single channels of dipoles, by reduced albedo
+    and index of refraction.
 
-    In units of squared mean free paths the variances depend only on these two. They are tabulated
-    at equal steps of `sqrt(1 - alpha')`, on which they depend smoothly, and their logarithms are
-    interpolated linearly. Outside the table the nearest entry is used.
+    In units of squared mean free paths the variances depend only on these two quantities. They are
+    smooth functions of `sqrt(1 - alpha')`, so they are tabulated at equal steps of it, and their
+    logarithms are interpolated linearly. Outside the table the nearest entry is used.
 
     **Attributes:**
 
     - `roots`: values of `sqrt(1 - alpha')`, equally spaced.
     - `etas`: indices of refraction, equally spaced.
-    - `log_variances`: one array per number of Gaussians, from 1 on.
+    - `log_variances`: one array per number of Gaussians, starting from 1.
     """
 
     roots: Float[Array, " roots"]
@@ -115,8 +117,8 @@ class DipoleStarts(eqx.Module):
 
 
 def constant(problem: FitProblem) -> FitProblem:
-    """Make a problem constant for derivatives, and convert it to JAX's default precision:
-    optimistix computes damping in that precision, whatever the precision of the problem.
+    """Make a problem constant for derivatives, and convert it to JAX's default precision, in which
+    optimistix computes the damping.
     """
     return jax.tree.map(
         lambda leaf: jax.lax.stop_gradient(leaf).astype(jnp.result_type(float)), problem
@@ -124,9 +126,9 @@ def constant(problem: FitProblem) -> FitProblem:
 
 
 def greedy_path(problem: FitProblem, max_count: int) -> Float[Array, "counts gaussians"]:
-    """Find nearly optimal log variances of 1, 2, ... Gaussians, each ascending and followed by
-    zeros. Each search starts from the best one with a Gaussian fewer: one is inserted in every gap
-    and at both ends, and the best result is kept.
+    """Find nearly optimal log variances of 1, 2, ... Gaussians, each ascending and padded with
+    zeros. Each search adds a Gaussian to the previous best result, in every gap and at both ends,
+    and keeps the best result.
     """
 
     def step(best, active_count):
@@ -144,8 +146,8 @@ def greedy_path(problem: FitProblem, max_count: int) -> Float[Array, "counts gau
 def _insert(
     best: Float[Array, " gaussians"], active_count: Int[Array, ""], place: Int[Array, ""]
 ) -> Float[Array, " gaussians"]:
-    """Append a log variance between two of the first `active_count - 1` ascending ones, or beyond
-    either end.
+    """Append a log variance that lies between two of the first `active_count - 1` ascending ones,
+    or beyond either end.
     """
     last = active_count - 1
     half = (_FIRST[1] - _FIRST[0]) / (2 * best.shape[0])
@@ -159,9 +161,9 @@ def _insert(
 def _descend(
     problem: FitProblem, start: Float[Array, " gaussians"], active: Bool[Array, " gaussians"] | None
 ) -> tuple[Float[Array, " gaussians"], Float[Array, ""]]:
-    """Descend from a start; return the end, and its sum of squares."""
-    # In units of the start's residual, so that damping and tolerances have the same effect for good
-    # and poor fits.
+    """Descend from a start, and return the end and its sum of squares."""
+    # Divide by the norm of the first residuals, so that damping and tolerances have the same effect
+    # for good and poor fits.
     unit = jnp.sqrt(_cost(problem.residuals(start, active)))
 
     def residuals(point, _):
@@ -195,7 +197,7 @@ def _cost(residuals: Float[Array, "channels nodes"]) -> Float[Array, ""]:
 
 
 class AbstractSpread(eqx.Module):
-    """The choice of channels that share their variances, and hence form one problem."""
+    """The choice of which channels share their variances and so form one problem."""
 
     @abc.abstractmethod
     def over(
@@ -204,12 +206,12 @@ class AbstractSpread(eqx.Module):
         problem: FitProblem,
         start: GivenVariances | None,
     ) -> Any:
-        """Apply a function to each problem and its start; several problems add a leading axis."""
+        """Apply a function to each problem and its start. Several problems add a leading axis."""
 
 
 class SharedVariances(AbstractSpread):
-    r"""One set of variances for all channels, as the renderer needs: it computes one layer for
-    each.
+    r"""One set of variances for all channels, as the renderer requires, which computes one layer
+    per variance.
 
     The fit minimizes the square of Eq. 4, summed over the channels.
     """
@@ -236,11 +238,11 @@ class VariancesPerChannel(AbstractSpread):
 def stationary(
     problem: FitProblem, optimum: Float[Array, " gaussians"]
 ) -> Float[Array, " gaussians"]:
-    r"""Differentiate an optimum by the implicit function theorem; its value is unchanged.
+    r"""Return an optimum unchanged, and differentiate it by the implicit function theorem.
 
     `g(log_variances, profile) = 0` at the optimum, so `d log_variances = -H^-1 dg`, where `H`, the
     derivative of `g`, is the full Hessian of Eq. 3 after the weights are eliminated (not the
-    Gauss-Newton approximation). It works in forward and reverse mode.
+    Gauss-Newton approximation). Both forward and reverse mode work.
     """
 
     def tangent_solve(linear, tangent):
@@ -258,7 +260,7 @@ def stationary(
 def refine(
     problem: FitProblem, start: Float[Array, " gaussians"]
 ) -> tuple[Float[Array, " gaussians"], Bool[Array, ""]]:
-    """Finish a fit by Newton's method with the full Hessian; also return whether it has
+    """Finish a fit by Newton's method with the full Hessian, and return whether it has
     converged.
     """
     problem, start = jax.lax.stop_gradient((problem, start))
@@ -267,8 +269,8 @@ def refine(
         best, newton, _, steps = state
         trial = best[0] - newton
         expansion = problem.expand(trial)
-        # Steps as small as rounding change the cost only by rounding. They end the search and are
-        # rejected.
+        # Steps as small as rounding do not change the cost significantly. They are rejected and end
+        # the search.
         moved = (steps == 0) | (
             jnp.max(jnp.abs(newton)) > _STEP * float(jnp.finfo(trial.dtype).eps)
         )
@@ -288,13 +290,13 @@ def refine(
 
 
 def _gain(expansion: Expansion) -> Float[Array, ""]:
-    """Compute the predicted decrease of the sum of squares for linear residuals; it is accurate in
-    float32, where the Hessian is not.
+    """Compute the predicted decrease of the sum of squares for linear residuals. Unlike the
+    Hessian, it is accurate in float32.
     """
     normal = jnp.einsum("cni,cnj->ij", expansion.jacobian, expansion.jacobian)
     squared = jnp.diagonal(normal)
     lengths = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-    # This replaces half the gradient: the Jacobian is orthogonal to the basis, so that rounding of
-    # the weights has no effect.
+    # This is half the gradient. The Jacobian is orthogonal to the basis, so rounding of the weights
+    # has no effect.
     along = jnp.einsum("cnk,cn->k", expansion.jacobian, expansion.residuals) / lengths
     return along @ invert_moving(normal / (lengths[:, None] * lengths[None])) @ along

@@ -1,5 +1,5 @@
-"""Factors on the weights of a sum of Gaussians as a function of parameters of the material: a
-table, interpolated by splines.
+"""Factors of the weights of a sum of Gaussians as a function of material parameters, tabulated and
+interpolated by splines.
 """
 
 import itertools
@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy  # its parts are loaded where they are used
+import scipy  # submodules load on first use
 from jaxtyping import Array, Float
 
 from splatjax._records import Numbers, as_floats, check_values, require
@@ -21,22 +21,22 @@ _MOST = 3  # largest number of parameters
 
 
 class WeightTable(eqx.Module):
-    r"""Factors on the weights of a base material, at the nodes of a grid of parameters.
+    r"""Factors of the weights of a base material, at the nodes of a grid of parameters.
 
-    Cubic splines along each parameter interpolate the roots of the factors and of the total
-    reflectance, and the factors of a channel are scaled to its total. They are exact at nodes,
-    never negative, and their slopes are continuous. The scale of a parameter is logarithmic if its
-    nodes are positive, else linear.
+    Cubic splines along each parameter interpolate the square roots of the factors and of the total
+    reflectance; the factors of a channel are then scaled to its total. The factors are exact at
+    nodes, never negative, and have continuous slopes. The scale of a parameter is logarithmic if
+    its nodes are positive, and otherwise linear.
 
     **Attributes:** (made by `weight_table`)
 
     - `names`: names of the parameters; `logarithmic`: whether the scale of each is logarithmic.
       Static.
-    - `base`: the Gaussians of the scene's material, whose weights are multiplied by the factors.
+    - `base`: the Gaussians of the scene's material, whose weights the factors multiply.
     - `limits`: the least and the largest value of each parameter.
     - `knots`: the nodes of each parameter, as fractions of its range on its scale.
-    - `slopes`: slopes at all knots of the splines that are 1 at one knot and 0 at the others.
-    - `at_nodes`: the factors, row by row of the grid; the last parameter varies fastest.
+    - `slopes`: slopes, at all knots, of the splines that are 1 at one knot and 0 at the others.
+    - `at_nodes`: the factors at the grid nodes; the last parameter varies fastest.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -48,20 +48,18 @@ class WeightTable(eqx.Module):
     at_nodes: Float[Array, "grid gaussians channels"]
 
     def factors(self, values: Mapping[str, Numbers]) -> Float[Array, "splats gaussians channels"]:
-        """Interpolate the factors for each splat: `Splats.weights`.
+        """Interpolate the factors for each splat, for `Splats.weights`.
 
         **Arguments:**
 
-        - `values`: values of each parameter, by name: one for each splat, or one for all.
-          Differentiable.
+        - `values`: values of each parameter by name, one per splat or one for all. Differentiable.
 
-        **Raises:** `ValueError` for parameters of other names, and for a value outside of the
-        table.
+        **Raises:** `ValueError` for other names of parameters, and for a value outside the table.
         """
         return self.interpolate(self.fractions(values))
 
     def fractions(self, values: Mapping[str, Numbers]) -> Float[Array, "splats parameters"]:
-        """Check values, and compute their positions in the ranges of their parameters, 0 to 1."""
+        """Check values, and compute their positions in the ranges of the parameters, 0 to 1."""
         require(
             set(values) == set(self.names),
             f"values are given for {', '.join(values)}; give {', '.join(self.names)}",
@@ -75,7 +73,9 @@ class WeightTable(eqx.Module):
         return (self._scaled(points) - low[None]) / (high - low)[None]
 
     def values(self, fractions: Float[Array, "splats parameters"]) -> dict[str, Array]:
-        """Compute parameter values from fractions of their ranges: the inverse of `fractions`."""
+        """Compute parameter values from fractions of their ranges. This is the inverse of
+        `fractions`.
+        """
         low, high = self._scaled(self.limits.T)
         rows = (low[None] + (high - low)[None] * fractions).T
         return {
@@ -126,8 +126,8 @@ def weight_table(
     nodes: Mapping[str, Numbers],
     base: SumOfGaussians,
 ) -> WeightTable:
-    r"""Tabulate, for one to three parameters such as melanin and blood, the factors that turn the
-    weights of a base material into those of the material with these parameters.
+    r"""Tabulate the factors that convert the weights of a base material to those of a material with
+    one to three parameters, such as melanin and blood.
 
         def skin(melanin, blood):
             return sj.scattering.Skin(melanin, blood, wavelengths=(620, 550, 460)).profile()
@@ -137,21 +137,21 @@ def weight_table(
         splats = replace(splats, weights=table.factors({"melanin": freckles, "blood": 0.01}))
 
     Each node is one fit of weights (`weight_factors`). For the table above, total reflectances
-    between nodes are within 1% of the profile's, and typically within 0.02%.
+    between nodes differ from those of the profile by at most 1%, and typically by 0.02%.
 
     **Arguments:**
 
-    - `profile_of`: computes the profile for a value of each parameter, given by name. It is called
-      in double precision.
-    - `nodes`: ascending values of one to three parameters, by name. Choose them denser where the
-      profile changes faster.
-    - `base`: the Gaussians of the material of the scene. A weight of 0 stays 0, so fit the base to
-      the widest profile, that of the least absorption.
+    - `profile_of`: computes the profile from a value of each parameter, passed by name, in double
+      precision.
+    - `nodes`: ascending values of each parameter, by name. Choose them denser where the profile
+      changes faster.
+    - `base`: the Gaussians of the scene's material. A weight of 0 stays 0, so fit the base to the
+      widest profile, which has the least absorption.
 
     **Returns:** a `WeightTable`, in the precision of the base.
 
-    **Raises:** `ValueError` for another number of parameters, and for fewer than two nodes or nodes
-    that do not ascend.
+    **Raises:** `ValueError` for more than three parameters or none, and for fewer than two nodes or
+    nodes that do not ascend.
     """
     require(1 <= len(nodes) <= _MOST, f"nodes has {len(nodes)} parameters; give one to {_MOST}")
     grid = {name: np.asarray(values, np.float64) for name, values in nodes.items()}

@@ -1,10 +1,10 @@
-"""Linear least squares with few unknowns, in plain array operations, and the weights of a fit for
-given variances.
+"""The weights of a fit for given variances: linear least squares with few unknowns, in plain array
+operations.
 
-The fit solves thousands of tiny systems at once inside a loop. Batched LAPACK calls inside the loop
-can deadlock on two cores; elimination of six columns avoids them. Columns are scaled to unit
-length, so that the condition number of the normal equations stays below 2000 for eight Gaussians,
-and one step of refinement restores the precision.
+The fit solves thousands of tiny systems at once inside a loop, where batched LAPACK calls can
+deadlock on two cores; elimination of a few columns avoids them. Columns have unit length, so the
+condition number of the normal equations stays below 2000 for eight Gaussians, and one step of
+refinement restores the precision.
 """
 
 import abc
@@ -21,18 +21,18 @@ from lineax.internal import (
     unravel_solution,
 )
 
-_UNSEEN = 1e-12  # ridge for Gaussians without norm at the nodes; all others have norm 1
+_UNSEEN = 1e-12  # ridge for Gaussians that vanish at the nodes; all others have norm 1
 _ROUNDING = 100.0
 _EXCHANGES = 64
 
 
 @jax.custom_jvp
 def invert(matrix: Float[Array, "columns columns"]) -> Float[Array, "columns columns"]:
-    """Invert a positive definite matrix by Gauss and Jordan's elimination, without pivoting."""
+    """Invert a positive definite matrix by Gauss-Jordan elimination without pivoting."""
 
     def eliminate(column, matrix):
         is_column = jnp.arange(matrix.shape[0]) == column
-        # The unit vector replaces the column, and becomes the column of the inverse.
+        # The unit vector replaces the column and becomes the column of the inverse.
         replaced = jnp.where(is_column[None], is_column[:, None].astype(matrix.dtype), matrix)
         row = replaced[column] / matrix[column, column]
         reduced = replaced - matrix[:, column][:, None] * row[None]
@@ -50,7 +50,7 @@ def _invert_jvp(primals, tangents):
 def invert_moving(
     hessian: Float[Array, "gaussians gaussians"],
 ) -> Float[Array, "gaussians gaussians"]:
-    """Invert a Hessian; a Gaussian of weight zero in all channels does not move."""
+    """Invert a Hessian so that a Gaussian with weight 0 in all channels does not move."""
     is_fixed = jnp.diagonal(hessian) == 0
     return invert(hessian + jnp.diag(is_fixed.astype(hessian.dtype)))
 
@@ -60,7 +60,9 @@ def least_squares(
     right: Float[Array, " rows"],
     inverse: Float[Array, "columns columns"],
 ) -> Float[Array, " columns"]:
-    """Find the `x` of the least `|matrix x - right|`; `inverse` is that of the normal equations."""
+    """Find the `x` that minimizes `|matrix x - right|`, given the `inverse` of the normal
+    equations.
+    """
     solution = inverse @ (matrix.T @ right)
     return solution + inverse @ (matrix.T @ (right - matrix @ solution))
 
@@ -75,7 +77,7 @@ class NormalEquations(lx.AbstractLinearSolver):
     def compute(self, state, vector, options):
         matrix, inverse, transposed, structures = state
         right = ravel_vector(vector, structures)
-        # The transposed system is wide: use its shortest solution.
+        # The transposed system is wide: compute its shortest solution.
         solution = (
             matrix @ (inverse @ right) if transposed else least_squares(matrix, right, inverse)
         )
@@ -93,7 +95,7 @@ class NormalEquations(lx.AbstractLinearSolver):
 
 
 class AbstractWeights(eqx.Module):
-    """The set of weights that a fit allows; it does not depend on the variances."""
+    """The set of weights that a fit allows. It does not depend on the variances."""
 
     @abc.abstractmethod
     def solve(
@@ -103,20 +105,20 @@ class AbstractWeights(eqx.Module):
         energies: Float[Array, " gaussians"],
         total: Float[Array, ""],
     ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
-        """Find the coefficients in the set with the least `|target - basis @ coefficients|`, and
-        their response.
+        """Find the allowed coefficients that minimize `|target - basis @ coefficients|`, and their
+        response.
 
         **Arguments:** (all differentiable)
 
-        - `basis`: scaled Gaussians at the nodes, times the roots of the quadrature's weights; of
-          full column rank.
+        - `basis`: scaled Gaussians at the nodes, times the square roots of the quadrature weights;
+          of full column rank.
         - `target`: the profile at the nodes, times the same roots.
-        - `energies`: weight of a unit coefficient; `energies @ coefficients` is the energy of the
+        - `energies`: weight per unit coefficient; `energies @ coefficients` is the energy of the
           sum.
         - `total`: the energy of the profile.
 
-        **Returns:** the coefficients, and their derivative with respect to `basis^T target`, which
-        is symmetric.
+        **Returns:** the coefficients, and their response: the derivative with respect to
+        `basis^T target`, which is symmetric.
         """
 
     def solve_active(
@@ -127,7 +129,7 @@ class AbstractWeights(eqx.Module):
         total: Float[Array, ""],
         active: Bool[Array, " gaussians"],
     ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
-        """Solve with the coefficients of idle Gaussians fixed at zero: one more row for each idle
+        """Solve with the coefficients of idle Gaussians fixed at 0. One extra row for each idle
         column keeps the rank full.
         """
         idle = jnp.diag((~active).astype(energies.dtype))
@@ -142,26 +144,25 @@ class AbstractWeights(eqx.Module):
 
 
 class FreeWeights(AbstractWeights):
-    """Unconstrained weights, for the least error (Eq. 3). Their sum may differ from the profile's
-    total reflectance by a few per cent.
+    """Unconstrained weights, which minimize the error (Eq. 3). Their sum may differ from the
+    profile's total reflectance by a few per cent.
     """
 
     def solve(self, basis, target, energies, total):
-        # Gaussians narrower than the first radius have no norm there: their coefficients are the
-        # shortest solution.
+        # Gaussians narrower than the first radius vanish at the nodes: take the shortest solution.
         ridge = _UNSEEN * jnp.eye(basis.shape[1], dtype=basis.dtype)
         inverse = invert(basis.T @ basis + ridge)
         return least_squares(basis, target, inverse), inverse
 
 
 class FixedTotalReflectance(AbstractWeights):
-    """Weights whose sum is the total reflectance of the profile: the picture keeps its energy, with
-    a slightly larger error.
+    """Weights whose sum is the total reflectance of the profile. The picture keeps its energy, and
+    the error is slightly larger.
     """
 
     def solve(self, basis, target, energies, total):
         free, inverse = FreeWeights().solve(basis, target, energies, total)
-        # The direction from the free optimum to the constraint that adds least to the error.
+        # The direction from the free optimum to the constraint that increases the error least.
         direction = inverse @ energies
         length = energies @ direction
         held = free + direction * ((total - energies @ free) / length)
@@ -169,16 +170,16 @@ class FixedTotalReflectance(AbstractWeights):
 
 
 class NonNegativeWeights(AbstractWeights):
-    """Non-negative weights, as in a mixture, under the constraint of `among`.
+    """Non-negative weights that also satisfy the constraint of `among`.
 
-    Fits of single channels of a dipole have no negative weights anyway. With shared variances, some
-    may become 0.
+    Fits to single channels of a dipole have no negative weights anyway. With shared variances, some
+    weights may become 0.
 
     **Attributes:**
 
     - `among`: `FreeWeights()` (default) or `FixedTotalReflectance()`.
 
-    **Source:** the Kuhn-Tucker conditions; indices are exchanged one at a time, the last first
+    **Source:** the Kuhn-Tucker conditions, solved by exchanging one index at a time, the last first
     (Murty 1974), which terminates for every positive definite problem.
     """
 
@@ -191,7 +192,7 @@ class NonNegativeWeights(AbstractWeights):
         def wrong(positive):
             coefficients, _ = self.among.solve_active(basis, target, energies, total, positive)
             slope = basis.T @ (basis @ coefficients - target)
-            # A fixed sum adds the same slope to all coefficients that are not zero.
+            # A fixed sum adds the same slope to all nonzero coefficients.
             share = jnp.where(positive, energies, 0.0)
             slope = slope - energies * (slope @ share) / jnp.maximum(share @ share, tolerance)
             return jnp.where(positive, coefficients < 0, slope < -tolerance)

@@ -1,4 +1,4 @@
-"""Makes and completes splats: bust, mesh sampling, normals, radii, areas."""
+"""Making and completing splats: the bust, mesh sampling, normals, radii and areas."""
 
 from ._bust import bust as bust, bust_mesh as bust_mesh, complexion as complexion
 from ._mesh import (

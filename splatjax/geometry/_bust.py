@@ -1,7 +1,7 @@
-"""A bust with the colors of skin, the default body: serene, eyes closed.
+"""The default body: a bust with closed eyes and the colors of skin.
 
-Its shape, `profiles/bust.npz`, was made for splatjax and has its license: the zero level of a
-signed distance, meshed to within 0.06 mm. Its colors are formulas.
+The shape, `profiles/bust.npz`, was made for splatjax and has the same license. It is the zero level
+of a signed distance function, meshed to within 0.06 mm. The colors are formulas.
 """
 
 import numpy as np
@@ -15,24 +15,23 @@ from splatjax.scene import Splats
 from ._mesh import Mesh, unit, vertex_normals
 from ._sample import sample_mesh
 
-_STEP, _TILT = 0.01, 0.002  # units in the file, of positions (mm) and of normals
+_STEP, _TILT = 0.01, 0.002  # units of positions (mm) and of normals in the file
 _MIDDLE = np.asarray([0.0, -30.0, -10.0])
 
 
 def bust_mesh() -> Mesh:
-    r"""Read a head with neck and shoulders as a closed mesh, life-size: mm, +y up, facing +z, eyes
-    near y = 0.
+    r"""Read a life-size head with neck and shoulders as a closed mesh, in mm, with +y up, facing
+    +z, eyes near y = 0.
 
     **Returns:** the mesh, with normals and texture coordinates: u is the longitude around the
-    vertical axis (0.5 the face, the seam at the back), v the angle from the bottom, both seen from
-    a point inside the head.
+    vertical axis (0.5 at the face, the seam at the back), and v is the angle from the bottom, both
+    about a point inside the head.
     """
     with np.load(profiles_folder() / "bust.npz") as file:
         steps, corners, tilts = (file[name].astype(int) for name in ("steps", "corners", "tilts"))
-    # Each vertex is stored as the step from the previous one, in the order in which faces first use
-    # them.
+    # Vertices are stored as differences, in the order in which faces first use them.
     vertices = _STEP * np.cumsum(steps, axis=0)
-    # A corner is 0 for a new vertex, else k for the k-th last of the vertices so far.
+    # A corner is 0 for a new vertex, and k for the k-th last of the vertices so far.
     faces = (np.cumsum(corners == 0) - np.maximum(corners, 1)).reshape(-1, 3)
     # Normals are stored as tilts from the mean normal of the surrounding faces.
     normals = unit(vertex_normals(vertices, faces) + _TILT * tilts)
@@ -52,11 +51,11 @@ def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
     - `count`: number of splats, at least 1.
     - `seed`: seed of the random positions; the same seed gives the same splats.
 
-    **Returns:** splats with albedo, specular and roughness, mm, in JAX's default precision and in
-    Morton order. Their areas add up to the area of the mesh. `splatjax.geometry.sample_mesh`
-    describes their distribution.
+    **Returns:** splats with albedo, specular and roughness, in mm, JAX's default precision and
+    Morton order. Their areas sum to the area of the mesh. `splatjax.geometry.sample_mesh` describes
+    their distribution.
 
-    **Raises:** `ValueError` when `count` is below 1.
+    **Raises:** `ValueError` if `count` is below 1.
     """
     splats = sample_mesh(bust_mesh(), count, seed=seed, rounded=True, relaxations=2)
     colors = complexion(np.asarray(splats.centers, np.float64))
@@ -64,7 +63,7 @@ def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
 
 
 _SKIN = np.asarray([0.60, 0.375, 0.285])
-_BLOOD = np.asarray([1.0, 0.70, 0.68])  # factor on each channel for more blood below the skin
+_BLOOD = np.asarray([1.0, 0.70, 0.68])  # factor of each channel for more blood below the skin
 _LIPS = np.asarray([0.50, 0.205, 0.185])
 _HAIR = np.asarray([0.15, 0.095, 0.07])
 _SCALP = np.asarray([0.47, 0.335, 0.285])
@@ -73,8 +72,8 @@ _SCALP = np.asarray([0.47, 0.335, 0.285])
 def complexion(
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return linear albedo in (0, 1), and the factors on specular strength and roughness, at points
-    of the bust (mm).
+    """Compute the linear albedo, in (0, 1), and the factors of specular strength and roughness at
+    points of the bust (mm).
     """
     x, y, z = points.T
     side, front = np.abs(x), smooth_step(z, 20, 60)
@@ -109,7 +108,7 @@ def bump(x, center, width):
 
 
 def _scalp(x, y, z):
-    """A shaven scalp, down to the hairline."""
+    """Compute a mask of the shaven scalp, down to the hairline."""
     behind = smooth_step(z, 62, 44) * smooth_step(y, 44, 62)
     temples = smooth_step(z, 16, 2) * smooth_step(y, 2, 24)
     nape = smooth_step(z, -42, -60) * smooth_step(y, -62, -40)
@@ -124,7 +123,7 @@ def _lips(side, y, z):
 
 
 def _brows(points, side, y, z):
-    """Brows: an arch, with single hairs along it."""
+    """Compute a mask of the brows: an arch with single hairs."""
     rise = np.sin(np.clip((side - 12) / 44, 0, 1) * np.pi * 0.62)
     arch = 25.5 + 6.0 * rise - 0.16 * np.maximum(side - 42, 0)
     across = bump(y, arch, 4.4 - 0.06 * np.clip(side - 14, 0, 42)) * smooth_step(z, 30, 45)
@@ -139,8 +138,8 @@ def _lashes(side, y, z):
 
 
 def _mottling(points: Float[np.ndarray, "n 3"], size: float, seed: int) -> Float[np.ndarray, " n"]:
-    """Compute smooth noise of about unit variance whose patches are of the given size, mm: 16 waves
-    in random directions.
+    """Compute smooth noise of about unit variance with patches of a given size, mm, as a sum of 16
+    waves in random directions.
     """
     random = np.random.default_rng(seed)
     directions = random.normal(size=(3, 16))

@@ -1,28 +1,28 @@
-"""Triangle meshes (host arrays, mm): edges, hard edges, and cuts by a plane."""
+"""Triangle meshes as host arrays in mm: edges, hard edges, and cuts by a plane."""
 
 from typing import Any
 
 import equinox as eqx
 import numpy as np
-import scipy  # its parts are loaded where they are used, which takes a third of a second
+import scipy  # submodules load on first use, which takes a third of a second
 from jaxtyping import Bool, Float, Int
 
 
 class Mesh(eqx.Module):
-    r"""Triangles with normals and texture coordinates; NumPy arrays on the host, mm, right-handed.
+    r"""Triangles with normals and texture coordinates, as NumPy arrays in mm, right-handed.
 
-    Texture coordinates belong to the corners of triangles, not to vertices, so that a mesh stays
+    Texture coordinates belong to the corners of triangles, not to vertices, so that a mesh is
     closed across the seams of its texture.
 
     **Attributes:**
 
     - `vertices`: mm.
-    - `faces`: vertices of each triangle, counterclockwise seen from outside.
-    - `normals`: unit, outward, one per vertex.
-    - `uvs`: per face and corner; u to the right and v *up*, so that (0, 0) is the lower left corner
-      of a texture and (0, 1) the upper left, where its row 0 begins. `None` where there are none.
-    - `colors`: colors of the vertices, linear, in [0, 1]. `None` where there are none.
-    - `parts`: number of the part that each face belongs to, where parts have textures of their own.
+    - `faces`: vertices of each triangle, counterclockwise as seen from outside.
+    - `normals`: outward unit vectors, one per vertex.
+    - `uvs`: texture coordinates per face and corner, with u to the right and v *up*: (0, 0) is the
+      lower left corner of a texture, and (0, 1) the upper left, where row 0 begins. May be `None`.
+    - `colors`: colors of the vertices, linear, in [0, 1]. May be `None`.
+    - `parts`: number of each face's part, if parts have textures of their own.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -33,7 +33,7 @@ class Mesh(eqx.Module):
     parts: Int[np.ndarray, " faces"] | None = None
 
     def corners(self) -> Float[np.ndarray, "faces 3 3"]:
-        """Return the positions of each triangle's corners, mm."""
+        """Return the positions of the corners of each triangle, mm."""
         return self.vertices[self.faces]
 
     def face_areas(self) -> Float[np.ndarray, " faces"]:
@@ -46,7 +46,7 @@ class Mesh(eqx.Module):
         return float(self.face_areas().sum())
 
     def select(self, keep) -> "Mesh":
-        """Return the mesh of the chosen faces (a mask or indices), with all vertices."""
+        """Return the mesh of chosen faces (a mask or indices), with all vertices."""
         uvs, parts = (None if rows is None else rows[keep] for rows in (self.uvs, self.parts))
         return Mesh(self.vertices, self.faces[keep], self.normals, uvs, self.colors, parts)
 
@@ -54,8 +54,8 @@ class Mesh(eqx.Module):
 def vertex_normals(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Compute unit vertex normals as the area-weighted mean of the normals of the faces around; +y
-    for a vertex without faces.
+    """Compute unit vertex normals as area-weighted means of the normals of adjacent faces; +y for a
+    vertex without faces.
     """
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     face_normals = np.cross(b - a, c - a)
@@ -64,20 +64,20 @@ def vertex_normals(
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Scale vectors to length one; a vector of length zero becomes +y."""
+    """Normalize vectors; a vector of length zero becomes +y."""
     x, y, z = np.moveaxis(vectors, -1, 0)  # sums over an axis of three are slow
     length = np.sqrt(x * x + y * y + z * z)[..., None]
     up = np.asarray([0.0, 1.0, 0.0], vectors.dtype)
     return np.where(length > 0, vectors / np.where(length > 0, length, 1), up)
 
 
-# Cosine of the angle between two triangles' normals at one place, below which their edge is hard.
+# Cosine between the normals of two triangles at a place below which their edge is hard.
 _SOFT = np.cos(np.radians(10))
 
 
 def shared_edges(places: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "n 2 2"]:
-    """Pair the edges of triangles that join the same two places, given the places of all corners.
-    At an edge of more than two triangles, each triangle is paired with the next.
+    """Pair the edges of triangles that join the same two places. At an edge of more than two
+    triangles, each triangle is paired with the next.
 
     **Returns:** the corners of the two triangles at each end of an edge, as `3 * face + k`.
     """
@@ -95,7 +95,7 @@ def shared_edges(places: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "n 2 2"]
 def hard_edges(
     mesh: Mesh, places: Int[np.ndarray, "faces 3"]
 ) -> tuple[Int[np.ndarray, "n 2 2"], Bool[np.ndarray, " n"]]:
-    """Find shared edges, and mark hard ones, where the normals of two triangles differ."""
+    """Find shared edges, and mark the hard ones, where the normals of the two triangles differ."""
     corners = shared_edges(places)
     normals = mesh.normals[mesh.faces].reshape(-1, 3)[corners]
     cosines = np.einsum("nei,nei->ne", normals[:, :, 0], normals[:, :, 1])
@@ -103,10 +103,10 @@ def hard_edges(
 
 
 def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
-    """Find, per triangle and corner, the triangle beyond the edge opposite to the corner; -1 where
-    the surface ends there, or the edge is hard.
+    """Find, for each corner of each triangle, the triangle across the opposite edge; -1 at a border
+    or a hard edge.
 
-    Texture coordinates cut meshes open along their seams, so vertices at one place count as one.
+    Vertices at the same place count as one, because files duplicate vertices along texture seams.
     """
     corners, are_hard = hard_edges(mesh, distinct(mesh.vertices)[1][mesh.faces])
     faces = corners[~are_hard, 0] // 3
@@ -117,23 +117,22 @@ def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
 
 
 def split_creases(mesh: Mesh, degrees: float) -> Mesh:
-    """Estimate missing normals of a mesh, and replace inconsistent ones, so that edges are hard
-    where triangles differ by more than an angle.
+    """Estimate missing normals of a mesh and replace inconsistent ones, so that edges between
+    triangles that differ by more than an angle are hard.
 
-    Around each vertex, triangles that are joined by soft edges share a normal, the mean of their
-    normals weighted by their angles at the vertex. A vertex keeps its normal if it is within the
-    given angle of all its triangles.
+    Around each vertex, triangles that soft edges connect share a normal, the mean of their normals
+    weighted by their angles at the vertex. A vertex keeps its normal if it is within the given
+    angle of the normals of all its triangles.
 
     **Arguments:**
 
     - `mesh`: normals of length zero are estimated.
     - `degrees`: the angle, from 0 to 180.
 
-    **Returns:** the mesh without triangles of zero area, with one vertex at a place for each normal
-    there.
+    **Returns:** the mesh without triangles of zero area, with one vertex per place and normal.
 
-    **Source:** Thürmer and Wüthrich 1998, "Computing Vertex Normals from Polygonal Facets", for the
-    mean by angles.
+    **Source:** Thürmer and Wüthrich 1998, "Computing Vertex Normals from Polygonal Facets" (weights
+    by angle).
     """
     cosine = np.cos(np.radians(degrees))
     mesh = mesh.select(mesh.face_areas() > 0)
@@ -154,8 +153,7 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
     angles = np.arccos(np.clip(-np.einsum("fki,fki->fk", sides, np.roll(sides, 1, axis=1)), -1, 1))
     shares = (angles[..., None] * facing[:, None]).reshape(-1, 3)
     estimated = unit(np.stack([np.bincount(groups, share) for share in shares.T], axis=1))
-    # Make a new vertex for each pair of an old vertex and a group, or for each old vertex that is
-    # unchanged.
+    # Make a new vertex for each pair of an old vertex and a group, and for each unchanged vertex.
     vertex = mesh.faces.ravel()
     group = np.where(replaced[vertex], groups, -1)
     key = vertex * np.int64(len(estimated) + 1) + group
@@ -172,8 +170,8 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
 
 
 def cut_below(mesh: Mesh, height: float) -> Mesh:
-    """Return the mesh above `y = height` (mm), with triangles cut along the plane; the border stays
-    open. Triangles do not share vertices.
+    """Cut a mesh at `y = height` (mm), and return the part above, with an open border. Its
+    triangles do not share vertices.
     """
     y = mesh.corners()[..., 1] - height
     is_above = y >= 0
@@ -184,7 +182,7 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
     is_tip = is_above[split] == tip_above[:, None]
     turn = (is_tip.argmax(axis=1)[:, None] + np.arange(3)) % 3
     tip, left, right = np.moveaxis(np.eye(3)[turn], 1, 0)
-    # The formula is symmetric in the ends of an edge, so that neighbors cut it at the same point.
+    # The formula is symmetric in the ends of an edge, so neighbors cut it at the same point.
     off_tip, *off_ends = np.abs(np.take_along_axis(y[split], turn, axis=1)).T[..., None]
     first, second = (
         (off_end * tip + off_tip * end) / (off_end + off_tip)
@@ -215,7 +213,7 @@ _BITS = 21
 
 
 def _spread(x: np.ndarray) -> np.ndarray:
-    """Put two zero bits between the bits of 21-bit integers."""
+    """Insert two zero bits between the bits of 21-bit integers."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -228,8 +226,8 @@ def _spread(x: np.ndarray) -> np.ndarray:
 
 
 def morton_order(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """Return the order of points along the Morton curve of their bounding cube, 2^21 cells a side;
-    ties keep their order.
+    """Compute the order of points along the Morton curve of their bounding cube, with 2^21 cells a
+    side. Ties keep their order.
     """
     points = points.astype(np.float64)
     low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
@@ -242,8 +240,8 @@ def morton_order(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
 def distinct(
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[Int[np.ndarray, " places"], Int[np.ndarray, " n"]]:
-    """Return the first point of each place, in the order of the points, and the place of every
-    point.
+    """Return the index of the first point at each place, in order, and the number of each point's
+    place.
     """
     _, first, place = np.unique(points, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)

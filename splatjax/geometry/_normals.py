@@ -1,9 +1,9 @@
-"""Normals of raw points, and their orientation."""
+"""Estimation and orientation of the normals of raw points."""
 
 from collections.abc import Sequence
 
 import numpy as np
-import scipy  # its parts are loaded where they are used, which takes a third of a second
+import scipy  # submodules load on first use, which takes a third of a second
 from jaxtyping import Float, Int
 
 from splatjax.scene import even_directions
@@ -12,10 +12,10 @@ from ._mesh import distinct, morton_order
 from ._scatter import tangent_frames
 
 _CHUNK = 1 << 16
-# Reach of the weights, in distances of the farthest neighbor, so that it still counts.
+# Reach of the weights in distances of the farthest neighbor, so that it has a weight.
 _BEYOND = 1.05
 _WINDOW = 8  # nearest points to which a plane is fitted
-_FLAT = 1e-3  # of a window's squared size; planes that deviate by less count as equally good
+_FLAT = 1e-3  # relative to a window's squared size; planes with smaller deviations count as equal
 
 
 def estimate_normals(
@@ -24,21 +24,21 @@ def estimate_normals(
     r"""Estimate outward unit normals of points on a surface.
 
     A plane is fitted to the nearest points of each point (principal components, weighted by
-    distance). The normal of a point is the mean of the normals of its own plane and of its
-    neighbors' planes, each weighted by how well the plane fits its own points and this point. At an
-    edge, the planes of one side dominate; near a second sheet, the planes of the point's own sheet
-    do. Noise is averaged over many planes. Points that are visible from outside face the viewer;
-    hidden ones follow their neighbors, and a surface open to both sides faces away from its middle
-    at the farthest point.
+    distance). The normal of a point is a weighted mean over its plane and the planes of its
+    neighbors; the weight is large if a plane fits its own points and this point well. At an edge,
+    the planes of one side dominate; near a second sheet, those of the point's own sheet. Noise is
+    averaged over many planes. Normals of points that are visible from outside face the viewer, and
+    hidden points follow their neighbors. A surface open to both sides faces away from its center at
+    its farthest point.
 
     **Arguments:**
 
-    - `points`: mm, at least 4 at different places. Points at one place have one normal.
+    - `points`: mm, at least 4 distinct. Points at the same place have the same normal.
     - `neighbors`: number of neighbors in the mean.
 
     **Source:** Hoppe et al. 1992, "Surface Reconstruction from Unorganized Points", sections 3.2
     and 3.3; weights of Pauly et al. 2003, "Shape Modeling with Point-Sampled Geometry"; planes of
-    neighbors after the windows of Kuwahara et al. 1976.
+    neighbors like the windows of Kuwahara et al. 1976.
     """
     first, inverse = distinct(points)
     along = morton_order(points[first].astype(np.float32))
@@ -70,8 +70,8 @@ def _planes(
     distances: Float[np.ndarray, "n k"],
     near: Int[np.ndarray, "n k"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Compute the middle, the normal and the mean squared distance (mm^2) of the plane through each
-    point's window.
+    """Compute the center, the normal and the mean squared distance (mm^2) of the plane through the
+    window of each point.
     """
     distances, near = distances[:, : _WINDOW + 1], near[:, : _WINDOW + 1]
     middles, normals, off = np.empty(places.shape), np.empty(places.shape), np.empty(len(places))
@@ -90,9 +90,9 @@ def _planes(
 
 
 _VIEWS = 32
-_SURE = 0.7  # fraction of the votes that decides for a side
+_SURE = 0.7  # fraction of the votes that decides a side
 _DOUBT = 0.5  # votes added to the total, so that a side seen once is not yet certain
-_SMOOTH = 0.99  # least agreement of neighbors in one patch
+_SMOOTH = 0.99  # least agreement of neighbors in a patch
 _LEAST_PATCH = 100
 _BLOCK, _PROBES = 32, 256  # number of points summed as one; most points tested in a patch
 _CLEAR = 0.05
@@ -109,19 +109,19 @@ def outward_signs(
 ) -> Signs:
     r"""Compute the signs that orient normals outward.
 
-    The points are viewed from all around. If a point and its neighbors are visible from only one
-    side, that is the outer one. From there signs are propagated along a minimum spanning tree of
-    the neighborhood graph. Neighbors at `p_i` and `p_j` agree as far as one normal is the mirror
-    image of the other in the plane between the points, as on a circle, around an edge and across a
-    thin sheet, and the cost of an edge is `1.001 - |agreement|`. A part that is equally visible
-    from both sides, or invisible, faces away from its middle at its farthest point. Hidden parts
-    inside a body are cavities (`_turn_cavities`).
+    The points are viewed from all around. If a point and its neighbors are visible from one side
+    only, that is the outer side. From these points, signs are propagated along a minimum spanning
+    tree of the neighborhood graph. Neighbors at `p_i` and `p_j` agree to the extent that one normal
+    is the mirror image of the other in the plane between the points, as on a circle, around an edge
+    and across a thin sheet; the cost of an edge is `1.001 - |agreement|`. A part that is equally
+    visible from both sides, or invisible, faces away from its center at its farthest point. Hidden
+    parts inside a body are cavities (`_turn_cavities`).
 
     **Arguments:**
 
-    - `normals`: unit, of either sign.
-    - `near`: neighbors of each point, without itself, each at another place.
-    - `reaches`: distance of the last of them, mm.
+    - `normals`: unit vectors of either sign.
+    - `near`: neighbors of each point at other places, without itself.
+    - `reaches`: distance of the farthest of these neighbors, mm.
 
     **Source:** Hoppe et al. 1992, section 3.3; König and Gumhold 2009, "Consistent Propagation of
     Normal Orientations in Point Clouds", for agreement around edges.
@@ -137,16 +137,16 @@ def outward_signs(
         return signs
     areas = np.pi / near.shape[1] * reaches**2
     _turn_cavities(points, (areas * signs)[:, None] * normals, patches, signs)
-    sure[np.concatenate(patches)] = True  # points between patches follow them
+    sure[np.concatenate(patches)] = True  # points between patches keep their signs
     return _carried(points, normals, near, sure, signs)[0]
 
 
 def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs, Signs]:
-    """Count for each normal the views that it faces, less those that it faces away from, and the
-    views in which it is visible.
+    """Count for each normal the views that it faces minus those that it faces away from, and the
+    views in which its point is visible.
 
-    A point is visible if nothing is more than a pixel in front of it and the pixels around. A view
-    counts by its squared cosine.
+    A point is visible if nothing in its pixel and the adjacent pixels is more than a pixel in front
+    of it. A view is weighted by its squared cosine.
     """
     directions = even_directions(_VIEWS)
     frames = np.stack([*tangent_frames(directions), directions], axis=1).astype(np.float32)
@@ -174,7 +174,9 @@ def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs
 def _agreement(
     points: np.ndarray, normals: np.ndarray, starts: np.ndarray, ends: np.ndarray
 ) -> Signs:
-    """Compute cosines between normals and the mirror images of others in the plane between them."""
+    """Compute cosines between normals and the mirror images of other normals in the plane between
+    the points.
+    """
     between = points[ends] - points[starts]
     along = [np.einsum("ni,ni->n", normals[indices], between) for indices in (starts, ends)]
     squared = np.einsum("ni,ni->n", between, between)
@@ -184,8 +186,8 @@ def _agreement(
 def _carried(
     points: np.ndarray, normals: np.ndarray, near: np.ndarray, sure: np.ndarray, signs: Signs
 ) -> tuple[Signs, list[np.ndarray]]:
-    """Propagate signs from the points marked as sure to all others; also return the smoothly
-    connected patches of the others.
+    """Propagate signs from the points marked as sure to all others, and return the signs and the
+    smoothly connected patches of the others.
     """
     count, neighbors = near.shape
     free = np.flatnonzero(~sure)
@@ -196,7 +198,7 @@ def _carried(
     agreement = _agreement(points, normals, low, high)
     cost = 1.001 - np.minimum(np.abs(agreement), 1.0)
     parts = _components(cost, low, high, count)
-    # In each part without a certain point, the farthest point faces away from the middle.
+    # In each part without a sure point, the farthest point faces away from the center.
     sizes = np.bincount(parts)
     middles = np.stack([np.bincount(parts, axis) / sizes for axis in points.T], axis=-1)
     outward = points - middles[parts]
@@ -207,7 +209,7 @@ def _carried(
     farthest = farthest[farthest >= 0]
     facing = np.einsum("ni,ni->n", normals[farthest], outward[farthest])
     signs[farthest] = np.where(facing < 0, -1.0, 1.0)
-    # One more node is the parent of all roots; each other point follows its parent in the tree.
+    # An extra node is the parent of all roots; every other point follows its parent in the tree.
     roots = np.concatenate([np.flatnonzero(sure), farthest])
     ends = np.concatenate([low, roots]), np.concatenate([high, np.full(len(roots), count)])
     costs = np.concatenate([cost, np.full(len(roots), _ROOT)])
@@ -242,18 +244,18 @@ def _turn_cavities(
 ) -> None:
     r"""Reverse, in place, patches that would form a body inside a body.
 
-    The winding number of a surface is 0 outside, 1 inside, and their mean, 1/2, on the surface
-    itself. A patch is reversed if this brings the total winding number on it nearer to 1/2: on a
-    shell within a body it is 3/2 if the shell faces outward, and 1/2 if it faces its middle. The
-    largest patch comes first.
+    The winding number of a surface is 0 outside, 1 inside, and 1/2 on the surface itself. A patch
+    is reversed if this brings the total winding number on it closer to 1/2: on a shell inside a
+    body it is 3/2 if the shell faces outward, and 1/2 if it faces its center. The largest patch
+    comes first.
 
     **Arguments:**
 
     - `points`: mm, in an order that keeps nearby points together.
-    - `oriented`: normals whose length is the area of the point, mm^2; reversed for reversed
+    - `oriented`: normals whose length is the area of the point, mm^2; changed for reversed
       patches.
     - `patches`: indices of the points of each patch.
-    - `signs`: signs of the normals; reversed for reversed patches.
+    - `signs`: signs of the normals; changed for reversed patches.
 
     **Source:** Barill et al. 2018, "Fast Winding Numbers for Soups and Clouds", equation 4; Xu et
     al. 2023, "Globally Consistent Normal Orientation for Point Clouds by Regularizing the
@@ -275,8 +277,8 @@ def _winding(
     points: Float[np.ndarray, "n 3"],
     oriented: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, " probes"]:
-    """Compute winding numbers on a surface, summing points in blocks; the terms of the block around
-    a probe nearly cancel.
+    """Compute winding numbers at probes on a surface, summing points in blocks. The terms of the
+    block around a probe nearly cancel.
     """
     starts = np.arange(0, len(points), _BLOCK)
     sizes = np.diff(np.append(starts, len(points)))
@@ -285,7 +287,7 @@ def _winding(
         np.add.reduceat(oriented, starts),
     )
     angles = np.empty(len(probes))
-    for i, probe in enumerate(probes):  # one by one, so that memory does not grow with both numbers
+    for i, probe in enumerate(probes):  # one by one, to save memory
         ray = middles - probe[None]
         cubed = np.einsum("bi,bi->b", ray, ray) ** 1.5
         angles[i] = (np.einsum("bi,bi->b", ray, normals) / np.where(cubed > 0, cubed, np.inf)).sum()

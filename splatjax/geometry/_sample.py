@@ -1,4 +1,4 @@
-"""Splats from a triangle mesh with textures, or from points without normals, radii or areas."""
+"""Splats from a textured triangle mesh, or from points without normals, radii or areas."""
 
 import warnings
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-import scipy  # its parts are loaded where they are used, which takes a third of a second
+import scipy  # submodules load on first use, which takes a third of a second
 from jaxtyping import Float
 
 from splatjax.scene import Splats
@@ -17,18 +17,19 @@ from ._scatter import Rounding, SurfacePoints, mirror_images, scatter, surface_c
 
 
 class Textures(eqx.Module):
-    r"""Maps of a mesh; NumPy arrays, row 0 at the top, values linear. They repeat beyond [0, 1].
+    r"""Maps of a mesh, as NumPy arrays with linear values and row 0 at the top. They repeat beyond
+    [0, 1].
 
     **Attributes:**
 
-    - `albedo`: diffuse color, linear, in [0, 1]; or one map for each part of the mesh, of one pixel
-      for a part without texture.
-    - `specular`: factor on the material's specular strength.
-    - `roughness`: factor on the material's roughness.
-    - `normal`: tangent-space normals in [-1, 1]: x along u, y along v (*up*), z outward; of any
-      positive length.
+    - `albedo`: diffuse color, linear, in [0, 1]; or one map per part of the mesh, with a single
+      pixel for a part without texture.
+    - `specular`: factor of the material's specular strength.
+    - `roughness`: factor of the material's roughness.
+    - `normal`: tangent-space normals in [-1, 1], of any positive length: x along u, y along v
+      (*up*), z outward.
     - `parameters`: maps of parameters of the material, such as melanin, or one number for all.
-    - `weights`: computes `Splats.weights` from the parameters at the splats, by name: for instance
+    - `weights`: computes `Splats.weights` from the parameters at the splats, by name, such as
       `factors` of a `splatjax.fitting.WeightTable`.
     """
 
@@ -45,9 +46,9 @@ class Textures(eqx.Module):
 def lookup_at(
     mesh: Mesh, points: SurfacePoints, picture: Float[np.ndarray, "h w *channels"] | None
 ) -> Float[np.ndarray, "n *channels"] | None:
-    """Look up a picture at points on a mesh, bilinearly and periodically; `None` for no picture.
+    """Look up a picture at points on a mesh, bilinearly and periodically; `None` without a picture.
 
-    **Raises:** `ValueError` when the mesh has no texture coordinates.
+    **Raises:** `ValueError` if the mesh has no texture coordinates.
     """
     if picture is None:
         return None
@@ -69,8 +70,8 @@ def lookup_at(
 def albedo_at(
     textures: Textures, mesh: Mesh, points: SurfacePoints
 ) -> Float[np.ndarray, "n channels"] | None:
-    """Compute the albedo at points on a mesh: its texture times the colors of its vertices; `None`
-    if it has neither.
+    """Compute the albedo at points on a mesh, the product of texture and vertex colors; `None` if
+    the mesh has neither.
     """
     if isinstance(textures.albedo, tuple):
         assert mesh.parts is not None
@@ -96,11 +97,11 @@ def perturbed_normals(
     normals: Float[np.ndarray, "n 3"],
     tangent_space: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Transform tangent-space normals to world space, by the frame of the mesh's texture
-    coordinates, and normalize them.
+    """Transform tangent-space normals to world space, by the frame of the texture coordinates, and
+    normalize them.
 
-    The tangent is the direction in which u grows on the face, made orthogonal to the interpolated
-    normal; the bitangent completes the frame on the side where v grows. Faces with degenerate
+    The tangent is the direction of increasing u on the face, made orthogonal to the interpolated
+    normal; the bitangent completes the frame on the side of increasing v. Faces with degenerate
     texture coordinates keep the normal.
     """
     assert mesh.uvs is not None
@@ -130,19 +131,19 @@ def sample_mesh(
 
     - `mesh`: mm, with positive area.
     - `count`: number of splats, at least 1.
-    - `textures`: looked up bilinearly at every splat.
+    - `textures`: maps that are looked up bilinearly at every splat.
     - `seed`: seed of the random positions; the same seed gives the same splats.
-    - `rounded`: place splats on a curved surface that follows the mesh's normals, instead of on
-      flat triangles.
+    - `rounded`: place splats on a curved surface that follows the normals of the mesh, instead of
+      on flat triangles.
     - `relaxations`: number of times that splats are moved to the centroids of their cells.
 
-    **Returns:** splats in Morton order, in JAX's default precision. Their areas are the areas of
-    their Voronoi cells on the surface, all scaled by one factor so that they add up to the
-    surface's area; their radii are `1.5 sqrt(area)`, and at least 1.2 times the distance of the
-    farthest corner of the cell, so that the discs leave no hole.
+    **Returns:** splats in Morton order, in JAX's default precision. The areas are those of the
+    Voronoi cells on the surface, scaled by a common factor to sum to the area of the surface. The
+    radii are `1.5 sqrt(area)`, and at least 1.2 times the distance of the farthest corner of the
+    cell, so that the discs leave no hole.
 
-    **Raises:** `ValueError` for a count below 1, a mesh without area, or textures on a mesh without
-    UVs.
+    **Raises:** `ValueError` for a count below 1, for a mesh without area, and for textures on a
+    mesh without UVs.
     """
     points = scatter(mesh, count, seed=seed, relaxations=relaxations)
     centers, area = points.positions(mesh), mesh.area()
@@ -165,7 +166,7 @@ def sample_mesh(
             raise ValueError(f"{name} has shape {given.shape}; give a gray map, or one number")
         if not given.ndim:
             return np.full(len(centers), given)
-        # Rounding would lead beyond the values of the map.
+        # Rounding could exceed the range of the map.
         return np.clip(np.asarray(lookup_at(mesh, points, given)), given.min(), given.max())
 
     values = {name: at_points(name, given) for name, given in textures.parameters.items()}
@@ -190,10 +191,10 @@ def _radii(
     images: Float[np.ndarray, "n images 3"] | None = None,
     spacing: float = 0.0,
 ) -> Float[np.ndarray, " n"]:
-    """Choose radii that leave no hole, and extend little beyond the borders of the surface.
+    """Choose radii that leave no hole and extend little beyond the borders of the surface.
 
-    A splat is visible up to about 0.8 of its radius. A third of a spacing beyond a border, the
-    visible edges form a straight line, and the border itself is fully covered.
+    A splat is visible up to about 0.8 of its radius. The visible edges form a straight line a third
+    of a spacing beyond a border, so the border itself is fully covered.
     """
     radii = 1.5 * np.sqrt(areas)
     if images is not None and images.shape[1]:
@@ -204,7 +205,7 @@ def _radii(
 
 
 _NEIGHBORS = 8
-# An isolated point is this many times farther from its neighbors than these from theirs.
+# An isolated point is this many times farther from its neighbors than they are from theirs.
 _ALONE = 5.0
 
 
@@ -219,18 +220,18 @@ def complete_splats(
     roughness: Float[np.ndarray, " splats"] | None = None,
     weights: Float[np.ndarray, "splats gaussians channels"] | None = None,
 ) -> Splats:
-    """Make splats from points, estimate missing fields, and sort them in Morton order.
+    """Make splats from points: estimate missing fields, and sort the splats in Morton order.
 
     **Arguments:**
 
     - `centers`: mm, at least one.
-    - `normals`: unit; `None` to estimate them from neighbors (`estimate_normals`).
+    - `normals`: unit vectors; `None` to estimate them from neighbors (`estimate_normals`).
     - `areas`: mm^2; `None` for the areas of the Voronoi cells in the tangent planes.
-    - `radii`: mm; `None` for radii as large as the cells require, so that no hole is left.
+    - `radii`: mm; `None` for radii that cover the cells, so that no hole is left.
     - `albedo`, `specular`, `roughness`, `weights`: as in `Splats`; never estimated.
 
     Isolated points are kept with the size of their neighbors, and a warning reports their number.
-    Points at one place share their area.
+    Points at the same place share their area.
 
     **Returns:** as many splats as points, in JAX's default precision.
 
@@ -258,12 +259,12 @@ def complete_splats(
 
 
 def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    r"""Compute areas and radii; isolated points get those of their neighbors, so that their discs
+    r"""Compute areas and radii. Isolated points get those of their neighbors, so that their discs
     do not hide the body.
 
-    A point is isolated if it is much farther from its neighbors than these are from their own, and
-    is no other point's neighbor. Sparse regions and borders between dense and sparse regions
-    therefore have no isolated points.
+    A point is isolated if it is much farther from its neighbors than they are from their own, and
+    is not a neighbor of any other point. Sparse regions and borders between dense and sparse
+    regions therefore contain no isolated points.
 
     **Source:** after Breunig et al. 2000, "LOF: Identifying Density-Based Local Outliers", with
     medians instead of means.
@@ -285,7 +286,7 @@ def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.n
         warnings.warn(
             f"{alone.sum()} of {len(centers)} points are isolated, one of them "
             f"{distances[alone].max():.3g} mm from its neighbors; they are kept with the size "
-            "of those, so remove them if they are noise of a scanner",
+            "of their neighbors, so remove them if they are noise of a scanner",
             stacklevel=3,
         )
     return (areas / np.bincount(place))[place], radii[place]

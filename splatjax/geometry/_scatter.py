@@ -1,12 +1,12 @@
-"""Points spread evenly over a triangle mesh, on its triangles or on a curved surface, and their
-Voronoi cells in the tangent planes.
+"""Evenly spread points on a triangle mesh, on flat triangles or a curved surface, and their Voronoi
+cells in the tangent planes.
 """
 
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # its parts are loaded where they are used, which takes a third of a second
+import scipy  # submodules load on first use, which takes a third of a second
 from jaxtyping import Float, Int
 
 from splatjax._records import require
@@ -20,7 +20,7 @@ _OPEN_END = 0.75
 def tangent_frames(
     normals: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Compute two unit vectors that make a right-handed frame with each normal.
+    """Compute two unit vectors that form a right-handed frame with each normal.
 
     **Source:** Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
     """
@@ -45,25 +45,25 @@ def surface_cells(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     r"""Measure the Voronoi cell of each point in its tangent plane.
 
-    The border of a cell in the direction `u` is at `r(u) = min_j |d_j|^2 / (2 d_j . u)` over the
-    neighbors at `d_j`; its area is `1/2` the integral of `r^2` over all directions and its centroid
-    `1/3` that of `r^3 u`, divided by the area. Neighbors that face away (the other side of a thin
-    sheet) do not count. At the border of the surface, a cell ends at `limit`. Coincident points
-    share a cell.
+    In the direction `u` the border of a cell is at `r(u) = min_j |d_j|^2 / (2 d_j . u)` over the
+    neighbors at `d_j`. The area is `1/2` the integral of `r^2` over all directions; the centroid is
+    `1/3` the integral of `r^3 u`, divided by the area. Neighbors that face away (the other side of
+    a thin sheet) do not count. At the border of the surface, a cell ends at `limit`. Coincident
+    points share a cell.
 
     **Arguments:**
 
-    - `points`: mm; fastest in Morton order.
-    - `normals`: unit.
+    - `points`: mm; Morton order is fastest.
+    - `normals`: unit vectors.
     - `images`: vectors from each point to its mirror images at the borders of the surface; zero for
       none.
     - `neighbors`: number of nearest points to consider.
-    - `limit`: mm; `None`: 0.75 of the mean distance to the six nearest points.
+    - `limit`: mm; `None` for 0.75 of the mean distance to the six nearest points.
     - `directions`: number of directions of the quadrature; with 32, areas are accurate to about 1%.
 
-    **Returns:** per point: the area of its cell (mm^2), its farthest corner (mm), and the vector to
-    its centroid (mm). On an evenly sampled closed surface, the areas add up to the area of the
-    surface within about 1%.
+    **Returns:** for each cell, its area (mm^2), the distance to its farthest corner (mm), and the
+    vector to its centroid (mm). On an evenly sampled closed surface, the areas sum to the area of
+    the surface within about 1%.
     """
     count = len(points)
     if count == 1:
@@ -110,14 +110,12 @@ def surface_cells(
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence
 _EDGE_TOLERANCE = 1e-9
 _WALK = 64
-# Length of the pieces of a border, in spacings; number of pieces near a point.
+# Length of the pieces of a border, in spacings; number of pieces considered near a point.
 _PIECE, _IMAGES = 0.25, 8
 
 
 class SurfacePoints(NamedTuple):
-    """Points on a mesh: the face of each, and its barycentric coordinates there (non-negative,
-    adding up to 1).
-    """
+    """Points on a mesh, given by faces and barycentric coordinates (non-negative, with sum 1)."""
 
     faces: Int[np.ndarray, " n"]
     barycentrics: Float[np.ndarray, "n 3"]
@@ -127,32 +125,32 @@ class SurfacePoints(NamedTuple):
         return np.einsum("nc,nci->ni", self.barycentrics, mesh.vertices[mesh.faces[self.faces]])
 
     def normals(self, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-        """Compute unit normals, interpolated between the normals of the vertices."""
+        """Compute unit normals by interpolating those of the vertices."""
         return unit(
             np.einsum("nc,nci->ni", self.barycentrics, mesh.normals[mesh.faces[self.faces]])
         )
 
     def take(self, order: Int[np.ndarray, " m"]) -> "SurfacePoints":
-        """Return some of the points, or all in another order."""
+        """Return the points at given indices."""
         return SurfacePoints(self.faces[order], self.barycentrics[order])
 
 
 def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> SurfacePoints:
     r"""Spread points over a mesh with uniform density and blue noise.
 
-    Points are distributed evenly along a Morton curve of the triangles, by a low-discrepancy
-    sequence inside each, then moved `relaxations` times to the centroids of their Voronoi cells
-    (Lloyd), along the surface.
+    Points are distributed evenly along a Morton curve of the triangles, and by a low-discrepancy
+    sequence inside each triangle. Then they are moved `relaxations` times along the surface to the
+    centroids of their Voronoi cells (Lloyd).
 
     **Arguments:**
 
     - `mesh`: with positive area.
     - `count`: number of points, at least 1.
-    - `seed`: of the random positions; the same seed gives the same points.
+    - `seed`: seed of the random positions; the same seed gives the same points.
 
     **Returns:** the points, in Morton order.
 
-    **Raises:** `ValueError` when `count` is below 1 or the mesh has no area.
+    **Raises:** `ValueError` if `count` is below 1 or the mesh has no area.
     """
     require(
         isinstance(count, int | float | np.number) and count >= 1,
@@ -195,9 +193,9 @@ def mirror_images(
     points: Float[np.ndarray, "n 3"],
     spacing: float,
 ) -> Float[np.ndarray, "n images 3"]:
-    """Mirror each point at the borders of a mesh within about a spacing of it.
+    """Mirror each point at the borders of the mesh that are within about one spacing.
 
-    **Returns:** the vector to each image; zero if there is none.
+    **Returns:** the vector to each image, or zero if there is none.
     """
     faces, corners = np.nonzero(beyond < 0)
     if not len(faces):
@@ -222,7 +220,7 @@ def mirror_images(
 
 
 def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Compute barycentric coordinates of the points' projections to the planes of their faces."""
+    """Compute barycentric coordinates of points projected onto the planes of their faces."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
     vectors = np.stack([b - a, c - a, points - a])
     (d00, d01, d20), (_, d11, d21), _ = np.einsum("ani,bni->abn", vectors, vectors)
@@ -250,25 +248,25 @@ def _settle(mesh: Mesh, beyond: np.ndarray, faces: np.ndarray, points: np.ndarra
 
 
 _MIDDLES = 0.5 * np.asarray([[1.0, 1, 0], [0, 1, 1], [1, 0, 1]])
-# The quarters of a triangle whose corners are followed by the middles of its edges.
+# The quarters of a triangle, by indices of its corners and then of the midpoints of its edges.
 _QUARTERS = np.asarray([[0, 3, 5], [1, 4, 3], [2, 5, 4], [3, 4, 5]])
 
 
 class Rounding:
     r"""A curved surface that follows the normals of a mesh.
 
-    Flat triangles with smooth normals shadow themselves, one by one, where the normals still face
-    the light, so that the edge between light and shadow is ragged. To second order, the surface
-    through the vertices with these normals has the point
+    Flat triangles with smooth normals shadow themselves one by one where the normals still face the
+    light, which makes the edge between light and shadow ragged. To second order, the surface
+    through the vertices with these normals contains the point
 
         x + 1/2 sum_i u_i ((v_i - x) . n_i) n_i
 
     for a point `x` of a triangle with corners `v_i`, normals `n_i` and barycentric coordinates
-    `u_i`. This equals a sum over edges, so that neighbors meet. Edges stay straight at the vertices
-    of hard edges: a box stays a box.
+    `u_i`. This equals a sum over edges, so neighboring triangles meet. Edges stay straight at the
+    vertices of hard edges, so a box stays a box.
 
-    **Source:** Boubekeur and Alexa 2008, "Phong tessellation", with the weight (they prefer 3/4)
-    that keeps spheres round.
+    **Source:** Boubekeur and Alexa 2008, "Phong tessellation", with the weight 1/2 instead of their
+    3/4, which keeps spheres round.
     """
 
     def __init__(self, mesh: Mesh):
@@ -279,7 +277,7 @@ class Rounding:
         self._mesh, self._is_smooth = mesh, is_smooth[place]
 
     def positions(self, points: SurfacePoints) -> Float[np.ndarray, "n 3"]:
-        """Return points of the mesh moved from its triangles to the surface, mm."""
+        """Move points of the mesh from its triangles to the surface, mm."""
         mesh, faces, moved = self._mesh, points.faces, points.positions(self._mesh)
         for start, end in ((0, 1), (1, 2), (2, 0)):
             v, w = mesh.faces[faces, start], mesh.faces[faces, end]

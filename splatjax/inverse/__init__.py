@@ -1,5 +1,5 @@
-"""Optical coefficients from pictures, with error bars; also maps of a material's parameters,
-albedo, lights, cameras and shape.
+"""Recovery of optical coefficients from pictures, with error bars, and of maps of material
+parameters, albedo, lights, cameras and shape.
 """
 
 from ._fit_scene import fit_scene as fit_scene

@@ -1,4 +1,4 @@
-"""Fit a scene to pictures along the gradient of the renderer: albedo, shape, lights and cameras."""
+"""Fits of a scene to pictures by gradients of the renderer: albedo, shape, lights and cameras."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -34,8 +34,8 @@ from ._problem import make_plans
 
 
 class Evaluation(eqx.Module):
-    """A rendered picture, the sum of the losses of its values, and the gradient of this sum with
-    respect to the coordinates of the picture.
+    """A rendered picture, its total loss, and the gradient of the loss with respect to the
+    coordinates of the picture.
     """
 
     loss: Float[Array, ""]
@@ -56,7 +56,7 @@ def evaluate(
     loss: AbstractLoss,
     background: AbstractBackground,
 ) -> Evaluation:
-    """Render a picture at its coordinates, and differentiate its loss."""
+    """Render a picture at given coordinates, and differentiate its loss."""
 
     def total_loss(x):
         moved = scene.moved(pictured, x)
@@ -77,7 +77,7 @@ def advance(
     expected: list[Array],
     optimizer: Any,
 ):
-    """Take a step; also return the loss before it, and whether loss and gradient are finite."""
+    """Take a step, and return the loss before the step and whether loss and gradient are finite."""
 
     def prior_loss(x):
         residuals = jax.tree.map(jnp.subtract, scene.prior_residuals(x), expected)
@@ -115,50 +115,50 @@ def fit_scene(
     progress: Callable[[str, float], None] | None = None,
     throw: bool = True,
 ) -> FittedScene:
-    r"""Fit parts of a scene to observed pictures, along the gradient of the rendered pictures.
+    r"""Fit parts of a scene to observed pictures by gradients of the rendered pictures.
 
         seen = Observation(picture, camera, lights, deviation=noise)
         optimizer = optax.adam(optax.cosine_decay_schedule(2.0, 60), b2=0.9)
         fitted = fit_scene([seen], splats, material, [AlbedoMap()], optimizer, steps=60)
         fitted.splats.albedo, fitted.losses
 
-    Each part has unbounded coordinates in units of its step. The optimizer works on these, so that
-    one learning rate serves all parts. The fit minimizes
+    Each part has unbounded coordinates in units of its step, so that one learning rate serves all
+    parts. The fit minimizes
 
         sum_pixels loss((rendered - observed) / noise) + sum_coordinates (change / deviation)^2
 
     divided by the number of pixel values that count. The `noise` is `Observation.deviation`. The
-    second sum is the prior of the parts that have a `deviation`. Nothing is compiled between steps.
-    If the scene exceeds the capacity of its plan, a new plan is made.
+    second sum is the prior of the parts that have a `deviation`. Nothing is recompiled between
+    steps, unless the scene exceeds the capacity of its plan and a new plan is made.
 
     **Arguments:**
 
-    - `observations`: one or more; `CameraPoses`, `LightStrengths` and `LightPlaces` start from
-      their cameras and lights, which are otherwise assumed right. Without a deviation, the noise is
-      1% of the root mean square of the picture.
+    - `observations`: one or more. `CameraPoses`, `LightStrengths` and `LightPlaces` start from
+      their cameras and lights; other cameras and lights are assumed exact. Without a deviation, the
+      noise is 1% of the root mean square of the picture.
     - `splats`: the body, mm; `AlbedoMap` and `NormalOffsets` start from it.
-    - `material`: the known material; with a `ParameterMap`, it must have the Gaussians of the
-      table. To find coefficients, use `recover`.
-    - `parts`: the parts that may change, each kind once.
-    - `optimizer`: any optimizer of optax whose update needs only gradients. Its learning rate is in
-      steps: `optax.adam(1.0)` first moves each coordinate by one step at a time. With a rate that
-      decays to zero, such as `optax.cosine_decay_schedule(1.0, steps)`, the fit converges.
+    - `material`: the known material. With a `ParameterMap`, it must have the Gaussians of the
+      table. To fit coefficients, use `recover`.
+    - `parts`: the parts that may change, each kind at most once.
+    - `optimizer`: any optax optimizer whose update needs only gradients. Its learning rate is in
+      units of the step: `optax.adam(1.0)` initially moves each coordinate by one step. For
+      convergence, use a rate that decays to 0, such as `optax.cosine_decay_schedule(1.0, steps)`.
     - `steps`: number of steps.
-    - `loss`: `SquaredLoss()`, or `HuberLoss()` where the model does not explain some pixels.
-    - `background`: with `UnknownBackground()` only pixels that the body fills count. With
-      `BlackBackground()` all unmasked pixels count, which determines cameras and outlines much
+    - `loss`: `SquaredLoss()`, or `HuberLoss()` if the model does not explain some pixels.
+    - `background`: with `UnknownBackground()`, only pixels that the body fills count. With
+      `BlackBackground()`, all unmasked pixels count, which determines cameras and outlines much
       better.
     - `settings`: settings of the renderer.
     - `start`: a fit to continue for another `steps` steps. If all other arguments are equal, the
-      result equals, bit for bit, the result of one fit with all steps.
+      result is bit for bit that of one fit with all steps.
     - `progress`: called with a description of each stage, and the loss.
-    - `throw`: raise when a loss or gradient is not finite; otherwise `result` reports it, and the
+    - `throw`: raise if a loss or gradient is not finite; otherwise `result` reports it, and the
       best scene so far is returned.
 
-    **Returns:** a `FittedScene`: the best of all steps, in the precision of the splats.
+    **Returns:** a `FittedScene` of the best step, in the precision of the splats.
 
-    **Raises:** `ValueError` for no observation, part or step, for a part given twice or with
-    nothing to change, for channels that disagree, for lights of unknown intensity (use
+    **Raises:** `ValueError` without observations, parts or steps, for a part given twice or without
+    anything to change, for unequal numbers of channels, for lights of unknown intensity (use
     `LightStrengths`), and for a picture without a pixel that counts; an error with the message of
     `result` if `throw`.
     """
@@ -197,7 +197,7 @@ def fit_scene(
         require(
             ours == given and len(start.state.plans) == len(observations),
             f"start is a fit of {len(start.state.plans)} pictures with coordinates {given}; "
-            f"{len(observations)} pictures with {ours} are given. Continue with the same parts, "
+            f"{len(observations)} pictures with {ours} are given; continue with the same parts, "
             "splats and number of pictures",
         )
         plans, times, expected = start.state.plans, start.plans, start.state.expected
@@ -274,7 +274,7 @@ def _check(
     kinds = [type(part).__name__ for part in parts]
     require(
         len(set(kinds)) == len(kinds),
-        f"each kind of part may be given once; parts are {', '.join(kinds)}",
+        f"parts are {', '.join(kinds)}; give each kind of part at most once",
     )
     check_channels(observations, material.channels, "material")
     for i, observation in enumerate(observations):

@@ -1,4 +1,4 @@
-"""The result of a fit, from which another fit may start; and its error bars: fits of perturbed
+"""The result of a fit, from which another fit may start, and error bars from fits of perturbed
 pictures.
 """
 
@@ -23,8 +23,8 @@ class FitState(eqx.Module):
 
     **Attributes:**
 
-    - `x`: the coordinates of the next step.
-    - `optimizer`: state of the optimizer; `None` for its initial state.
+    - `x`: the coordinates for the next step.
+    - `optimizer`: state of the optimizer; `None` for the initial state.
     - `plans`: plans of the pictures.
     - `expected`: means of the residuals of the priors; zero except in `randomized_fits`.
     """
@@ -44,13 +44,13 @@ class FittedScene(eqx.Module):
     - `cameras`, `lights`: cameras and lights of each picture; `material`: the given material.
     - `maps`: the values of each parameter of a `ParameterMap`, by name.
     - `losses`: loss at the start and after each step: the sum over all pixels and priors, divided
-      by the number of values that count. About 1 if the residual is noise.
-    - `best`: the step with the least loss, to which the other fields belong. Static.
+      by the number of values that count. It is about 1 if the residuals are noise.
+    - `best`: the step with the least loss, which the other fields describe. Static.
     - `plans`: number of plans, including the first. Static.
     - `pictures`: the rendered pictures; NaN where a pixel does not count.
     - `residuals`: rendered minus observed pictures.
     - `result`: the outcome, as a message (`optimistix.RESULTS`).
-    - `coordinates`, `state`: coordinates and state from which another fit can `start`.
+    - `coordinates`, `state`: coordinates and state for another fit to `start` from.
     """
 
     splats: Splats
@@ -68,7 +68,7 @@ class FittedScene(eqx.Module):
     plans: int = eqx.field(static=True)
 
     def restarted(self, expected: list[Array] | None = None) -> "FittedScene":
-        """Return the start of a new fit from the best step, with any optimizer; `expected` replaces
+        """Return the start of a new fit from the best step, with any optimizer. `expected` replaces
         the means of the residuals of the priors.
         """
         expected = self.state.expected if expected is None else expected
@@ -84,7 +84,7 @@ def randomized_fits(
     *,
     seed: int = 0,
 ) -> list[FittedScene]:
-    r"""Repeat a fit with perturbed pictures and priors: the spread of the results is the error bar.
+    r"""Repeat a fit with perturbed pictures and priors. The spread of the results is the error bar.
 
         fit = partial(
             sj.inverse.fit_scene, splats=splats, material=material, parts=parts,
@@ -95,23 +95,23 @@ def randomized_fits(
         bars = np.std([draw.maps["melanin"] for draw in draws], axis=0, ddof=1)
 
     Each fit starts from the best step of the given fit. Noise with the deviation of each picture is
-    added to it, and the mean of each prior is drawn at random, too. For a linear picture and
-    converged fits, the results are then draws from the posterior. Their spread describes noise and
-    priors, but neither errors of the model nor other solutions far away. A splat that no picture
-    shows has the spread of the prior. Nothing is compiled again.
+    added to the picture, and the mean of each prior is drawn at random too. For a linear picture
+    and converged fits, the results are draws from the posterior. Their spread includes noise and
+    priors, but neither errors of the model nor distant solutions. A splat that no picture shows has
+    the spread of the prior. Nothing is recompiled.
 
     **Arguments:**
 
-    - `fit`: function of observations and `start=` that calls `fit_scene`.
+    - `fit`: a function of observations and `start=` that calls `fit_scene`.
     - `observations`: the observations of the fit.
     - `fitted`: the converged fit.
-    - `count`: number of draws. The relative error of a bar is `1 / sqrt(2 (count - 1))`.
+    - `count`: number of draws. The relative error of an error bar is `1 / sqrt(2 (count - 1))`.
     - `seed`: seed of the noise.
 
     **Returns:** the fits.
 
     **Source:** Bardsley, Solonen, Haario and Laine 2014, "Randomize-then-optimize", without the
-    projection that makes it exact for pictures that are not linear.
+    projection that makes the draws exact for nonlinear pictures.
     """
     rng, draws = np.random.default_rng(seed), []
 

@@ -20,20 +20,20 @@ from splatjax.scene import (
     Splats,
 )
 
-# Coverage above which a pixel shows nothing behind the body.
+# Coverage above which a pixel shows only the body.
 _FILLED = 0.999
-# Assumed deviation of pictures without one, as a fraction of their brightness. Error bars do not
+# Assumed deviation of pictures without a deviation, relative to their brightness. Error bars do not
 # depend on it.
 _UNKNOWN_NOISE = 0.01
 
 
 class AbstractIntensity(eqx.Module):
-    """Unknown factors on all light of a picture, and the channels that share them."""
+    """Unknown factors of all light of a picture, and the channels that share them."""
 
     @abc.abstractmethod
     def groups(self, channels: int) -> np.ndarray:
-        """Return the index of each channel's factor among the factors of the picture; -1 for a
-        factor known to be 1.
+        """Return for each channel the index of its factor among those of the picture, or -1 if the
+        factor is known to be 1.
         """
 
 
@@ -45,17 +45,15 @@ class KnownIntensity(AbstractIntensity):
 
 
 class UnknownIntensity(AbstractIntensity):
-    """One factor for all channels: an exposure that was not measured, under light of a known
-    color.
-    """
+    """One factor for all channels, for an unmeasured exposure under light of a known color."""
 
     def groups(self, channels: int) -> np.ndarray:
         return np.zeros(channels, int)
 
 
 class UnknownColor(AbstractIntensity):
-    """A factor for each channel. Only the distribution of light over the picture then determines
-    the material.
+    """One factor per channel. Only the distribution of light over the picture then determines the
+    material.
     """
 
     def groups(self, channels: int) -> np.ndarray:
@@ -64,22 +62,22 @@ class UnknownColor(AbstractIntensity):
 
 @record
 class Observation(eqx.Module):
-    r"""A picture of the body, linear light, and how it was taken.
+    r"""A picture of the body in linear light, with its camera, lights and noise.
 
     **Attributes:**
 
     - `picture`: radiance, like `Frame.beauty`; NaN where a pixel is unknown.
-    - `camera`: a camera with as many pixels.
+    - `camera`: the camera, with as many pixels as the picture.
     - `lights`: all lights of the picture.
     - `mask`: the pixels that count; `None` for all. Pixels that the body does not fill count only
       with a `BlackBackground`.
-    - `deviation`: standard deviation of the noise, for each pixel and channel or one number.
-      `None`: it is unknown and uniform; error bars then follow from the residuals. Pictures without
-      a deviation have equal weight, each relative to its brightness.
-    - `intensity`: `KnownIntensity()`, or the unknown factors on the strength of the lights.
+    - `deviation`: standard deviation of the noise, one number or one per pixel and channel. `None`:
+      unknown and uniform; error bars are then computed from the residuals, and pictures have equal
+      weight relative to their brightness.
+    - `intensity`: `KnownIntensity()`, or the unknown factors of the strength of the lights.
 
-    **Raises:** `ValueError` for pictures, masks and deviations of other sizes than the camera's,
-    and for deviations that are not positive.
+    **Raises:** `ValueError` for pictures, masks and deviations whose size is not that of the
+    camera, and for deviations that are not positive.
     """
 
     picture: Float[Array, "height width channels"] = eqx.field(converter=numbers)
@@ -106,7 +104,7 @@ class Observation(eqx.Module):
 
 @record
 class Candidate(eqx.Module):
-    """A picture that could be taken: its name, camera and lights, whose strength may be unknown."""
+    """A picture that could be taken, with its name, camera and lights."""
 
     name: str = eqx.field(static=True)
     camera: Camera
@@ -115,7 +113,7 @@ class Candidate(eqx.Module):
 
 
 def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> list[Candidate]:
-    r"""Propose pictures that one could take with a camera: parallel light from the front, left,
+    r"""Propose pictures that could be taken with a camera: parallel light from the front, left,
     right, above and behind, and a laser dot in the middle of the picture, as wide as a few splats.
 
     **Arguments:**
@@ -134,7 +132,7 @@ def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> lis
     }
     strength, eye = np.full(channels, np.pi), np.asarray(camera.position, float)
     squared_spacing = float(np.mean(splats.areas))
-    # To the splat nearest to the middle of the picture.
+    # Aim at the splat nearest to the middle of the picture.
     to_splats = np.asarray(splats.centers, float) - eye
     spot = to_splats[np.argmax(to_splats @ forward / np.linalg.norm(to_splats, axis=1))]
     beam = GaussianBeam(eye, spot, strength * squared_spacing, 4 * squared_spacing)
@@ -142,7 +140,7 @@ def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> lis
         name: DirectionalLight(direction=direction, irradiance=strength)
         for name, direction in directions.items()
     } | {"a laser dot in the middle": beam}
-    # In the precision of the body, whatever the default is.
+    # Use the precision of the body instead of the default.
     lights = jax.tree.map(lambda leaf: leaf.astype(splats.centers.dtype), lights)
     return [Candidate(name, camera, light) for name, light in lights.items()]
 
@@ -163,13 +161,15 @@ class AbstractLoss(eqx.Module):
 
     @abc.abstractmethod
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Compute the square root of the loss, with the sign of the residual; near zero it equals
+        """Compute the square root of the loss with the sign of the residual. Near zero it equals
         the residual.
         """
 
 
 class SquaredLoss(AbstractLoss):
-    """Squared loss: right for normal noise, but sensitive to highlights outside of the model."""
+    """Squared loss, which is right for normal noise but sensitive to highlights outside the
+    model.
+    """
 
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
         return residuals
@@ -177,8 +177,7 @@ class SquaredLoss(AbstractLoss):
 
 @record
 class HuberLoss(AbstractLoss):
-    r"""Squared loss for small residuals, and linear, `2 bend |r|`, for large ones, with a smooth
-    transition.
+    r"""A loss that is quadratic for small residuals and linear, `2 bend |r|`, for large ones.
 
         loss(r) = 2 b^2 (sqrt(1 + r^2 / b^2) - 1)
 
@@ -188,7 +187,7 @@ class HuberLoss(AbstractLoss):
 
     **Raises:** `ValueError` for a bend that is not positive.
 
-    **Source:** Huber 1964; in this smooth form Charbonnier and others 1997.
+    **Source:** Huber 1964; Charbonnier et al. 1997 (this smooth form).
     """
 
     bend: float = eqx.field(
@@ -200,15 +199,15 @@ class HuberLoss(AbstractLoss):
 
 
 class AbstractBackground(eqx.Module):
-    """The choice of the pixels that count, by their coverage."""
+    """The choice of the pixels that count by their coverage."""
 
     @abc.abstractmethod
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
-        """Return 1 for pixels that count, 0 for others; derivatives treat it as constant."""
+        """Return 1 for pixels that count, 0 for others, as a constant for differentiation."""
 
 
 class UnknownBackground(AbstractBackground):
-    """An unknown background: pixels that the body does not fill do not count, so silhouettes give
+    """An unknown background. Pixels that the body does not fill do not count, so silhouettes give
     no information.
     """
 
@@ -217,8 +216,8 @@ class UnknownBackground(AbstractBackground):
 
 
 class BlackBackground(AbstractBackground):
-    """A black background: all pixels count, and the outline of the body gives most of the
-    information about a camera's pose.
+    """A black background. All pixels count, and the outline of the body gives most of the
+    information about the pose of a camera.
     """
 
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
@@ -230,10 +229,10 @@ class Evidence(eqx.Module):
 
     **Attributes:**
 
-    - `picture`: 0 where it is unknown.
-    - `deviation`: standard deviation of its noise.
+    - `picture`: radiance; 0 where it is unknown.
+    - `deviation`: standard deviation of the noise.
     - `known`: pixels that may count.
-    - `relative_noise`: the deviation of a typical pixel over the brightness of the picture.
+    - `relative_noise`: deviation of a typical pixel divided by the brightness of the picture.
     """
 
     picture: Float[Array, "height width channels"]
@@ -264,7 +263,7 @@ class Evidence(eqx.Module):
     def counted(
         self, coverage: Float[Array, "height width"], background: AbstractBackground
     ) -> Float[Array, "height width"]:
-        """Return 1 for pixels that count, else 0."""
+        """Return 1 for pixels that count, and 0 for others."""
         return jnp.where(self.known, background.counts(coverage), 0.0)
 
     def residuals(
@@ -273,13 +272,15 @@ class Evidence(eqx.Module):
         counted: Float[Array, "height width"],
         loss: AbstractLoss,
     ) -> Float[Array, "height width channels"]:
-        """Compute residuals whose squares are the losses; 0 where a pixel does not count."""
+        """Compute residuals whose squares are the losses. They are 0 where a pixel does not
+        count.
+        """
         residuals = (picture - self.picture) / self.deviation
         return loss.root(jnp.where(counted[..., None] > 0, residuals, 0.0))
 
 
 def check_channels(observations: Sequence[Observation], channels: int, source: str) -> None:
-    """Raise `ValueError` for a picture of another number of channels than its source has."""
+    """Raise `ValueError` for a picture that does not have the number of channels of the source."""
     for i, observation in enumerate(observations):
         count = observation.picture.shape[2]
         require(
@@ -293,8 +294,8 @@ def check_counted(counted: Sequence[Float[Array, "height width"]]) -> None:
     for i, pixels in enumerate(counted):
         require(
             np.any(pixels),
-            f"no pixel of observations[{i}] counts: none is covered by the splats, kept by the "
-            "mask and finite; check camera, mask and NaN",
+            f"no pixel of observations[{i}] counts, because none is covered by the splats, kept by "
+            "the mask and finite; check camera, mask and NaN",
         )
 
 
@@ -303,7 +304,7 @@ def compared(
     counted: Sequence[Float[Array, "_ _"]],
     evidence: Sequence[Evidence],
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """Return the pictures, NaN where pixels do not count, and their residuals."""
+    """Return the pictures and their residuals, with NaN where pixels do not count."""
     rendered = tuple(
         np.where(np.asarray(pixels)[..., None] > 0, picture, np.nan)
         for picture, pixels in zip(pictures, counted, strict=True)

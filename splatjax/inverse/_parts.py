@@ -1,5 +1,5 @@
-"""Parts of a scene that may move, each in unbounded coordinates: albedo, lights and cameras; and
-the scene with all its movable parts.
+"""Movable parts of a scene in unbounded coordinates (albedo, lights and cameras), and the scene
+with all its movable parts.
 """
 
 import abc
@@ -17,20 +17,20 @@ from splatjax.scene import AbstractLight, Material, Splats, rotation_by
 
 from ._observation import PicturedScene
 
-# Bounded quantities start at least this far from 0 and 1, where their logits are infinite.
+# Least distance of initial values from 0 and 1, where logits are infinite.
 BOUNDED = 1e-3
 _PLACES = ("direction", "position", "origin")  # fields of lights
 
-# Coordinates of each part; a tuple with one entry per picture if pictures do not share the part.
+# Coordinates of each part, as a tuple with one entry per picture if pictures do not share the part.
 Coordinates = tuple[PyTree[Array], ...]
 
 
 class AbstractPart(eqx.Module):
-    r"""A part that may move. Its coordinates count steps from its start, where they are zero.
+    r"""A part that may move. Its coordinates are zero at the start, and are in units of its steps.
 
     **Attributes:** (of the class)
 
-    - `shared`: whether all pictures share the part; else each has its own.
+    - `shared`: whether all pictures share the part; otherwise each picture has its own.
     """
 
     shared: ClassVar[bool] = False
@@ -53,7 +53,7 @@ class AbstractPart(eqx.Module):
 
     @abc.abstractmethod
     def coordinates(self, pictured: PicturedScene) -> PyTree[Array]:
-        """Return the initial coordinates: zeros. Raise `ValueError` if there is no such part."""
+        """Return the initial coordinates, zeros. Raise `ValueError` if the scene lacks the part."""
 
     @abc.abstractmethod
     def moved(
@@ -62,26 +62,26 @@ class AbstractPart(eqx.Module):
         """Apply coordinates to the part. Differentiable."""
 
     def prior_residuals(self, x: PyTree[Array], prepared: PyTree[Array]) -> PyTree[Array]:
-        """Divide coordinates by their expected deviations; under the prior, the results are
-        independent, with mean 0 and deviation 1. Return `None` without a prior. Linear.
+        """Divide coordinates by their expected deviations. Under the prior, the results are
+        independent with mean 0 and deviation 1. Linear; `None` without a prior.
         """
         return None
 
     def maps(self, x: PyTree[Array], prepared: PyTree[Array]) -> dict[str, Float[Array, " splats"]]:
-        """Compute the maps of the part, by name; none unless it has parameters of the material."""
+        """Compute the maps of material parameters of the part, by name."""
         return {}
 
 
 class AlbedoMap(AbstractPart):
-    r"""The albedo of every splat and channel, as a logit: it stays between 0 and 1.
+    r"""The albedo of every splat and channel, as a logit so that it stays between 0 and 1.
 
         albedo = 1 / (1 + exp(-(logit(start) + step x)))
 
     **Attributes:** (static)
 
-    - `step`: a step of the logit: 0.1 moves an albedo of 0.5 by 0.025.
-    - `deviation`: expected distance of a logit from its start, one standard deviation of a normal
-      prior. An invisible splat keeps its albedo; a hardly visible one nearly keeps it.
+    - `step`: change of the logit per step: 0.1 moves an albedo of 0.5 by 0.025.
+    - `deviation`: standard deviation of the normal prior of a logit about its start. An invisible
+      splat keeps its albedo, and a hardly visible splat nearly keeps it.
 
     Initial albedos are clamped to [0.001, 0.999].
     """
@@ -109,12 +109,12 @@ class AlbedoMap(AbstractPart):
 
 
 class LightStrengths(AbstractPart):
-    """The logarithm of the strength of each light in each picture, channel by channel: irradiance,
-    intensity or power.
+    """The logarithm of the strength (irradiance, intensity or power) of each light in each picture,
+    per channel.
 
     **Attributes:** (static)
 
-    - `step`: a step of the logarithm: 0.05 is 5%.
+    - `step`: change of the logarithm per step; 0.05 is 5%.
     """
 
     step: float = eqx.field(static=True, default=0.05)
@@ -139,13 +139,13 @@ class LightStrengths(AbstractPart):
 
 
 class LightPlaces(AbstractPart):
-    """The position of each light of each picture: directions rotate, and point lights and the
-    origins of beams shift.
+    """The position or direction of each light in each picture. Directions rotate; point lights and
+    the origins of beams shift.
 
     **Attributes:** (static)
 
-    - `turn`: a step of a direction, radians.
-    - `shift`: a step of a position along each axis, mm.
+    - `turn`: rotation of a direction per step, radians.
+    - `shift`: shift of a position along each axis per step, mm.
     """
 
     turn: float = eqx.field(static=True, default=0.02)
@@ -171,16 +171,15 @@ class LightPlaces(AbstractPart):
 
 
 class CameraPoses(AbstractPart):
-    r"""Position and rotation of each camera, which rotates around the middle of the splats, and
-    shifts.
+    r"""The pose of each camera, which rotates around the center of the splats and shifts.
 
-    A rotation around the body changes the visible side, and a shift the position of the body in the
-    picture. Rotations around the pinhole would be nearly equivalent to shifts.
+    A rotation around the body changes the visible side; a shift changes the position of the body in
+    the picture. Rotations around the pinhole would be nearly equivalent to shifts.
 
     **Attributes:** (static)
 
-    - `turn`: a step of the rotation vector, radians.
-    - `shift`: a step along each axis, mm.
+    - `turn`: change of the rotation vector per step, radians.
+    - `shift`: shift along each axis per step, mm.
     """
 
     turn: float = eqx.field(static=True, default=2e-3)
@@ -203,7 +202,7 @@ class CameraPoses(AbstractPart):
 
 
 class MovableScene(eqx.Module):
-    """The material, and the parts of the scene that may move."""
+    """The material and the movable parts of a scene."""
 
     material: Material
     parts: tuple[AbstractPart, ...]
@@ -216,7 +215,7 @@ class MovableScene(eqx.Module):
         return cls(material, tuple(parts), tuple(part.prepared(splats) for part in parts))
 
     def start(self, pictured_scenes: Sequence[PicturedScene]) -> Coordinates:
-        """Return the coordinates of the start: zeros."""
+        """Return the initial coordinates, zeros."""
         return tuple(
             part.coordinates(pictured_scenes[0])
             if part.shared
@@ -232,7 +231,7 @@ class MovableScene(eqx.Module):
         )
 
     def of_all(self, pictures: Sequence[Coordinates]) -> Coordinates:
-        """Combine the derivatives of all pictures: add the derivatives of shared parts."""
+        """Combine the derivatives of all pictures, and add those of shared parts."""
         return tuple(
             jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *derivatives)
             if part.shared
@@ -256,7 +255,7 @@ class MovableScene(eqx.Module):
         )
 
     def maps(self, x: Coordinates) -> dict[str, Float[Array, " splats"]]:
-        """Compute the maps of parameters of the material, by name."""
+        """Compute the maps of material parameters, by name."""
         maps = {}
         for part, coordinates, prepared in zip(self.parts, x, self.prepared, strict=True):
             maps |= part.maps(coordinates, prepared)

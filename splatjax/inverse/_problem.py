@@ -1,4 +1,4 @@
-"""Residuals as a function of coefficients, from layers that serve many materials."""
+"""Residuals as a function of coefficients, computed from layers that serve many materials."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -35,22 +35,20 @@ from ._observation import (
 )
 
 _STEPS = 64
-# Ratio of neighboring variances in a wide range; fits of dipoles then have an error of 0.2%.
+# Ratio of neighboring variances in a wide range, with which fits of dipoles have an error of 0.2%.
 _LARGER = 3.0
-# Squared mean free paths: the range of the Gaussians of a dipole's fit, and beyond.
+# Range of variances, in squared mean free paths, that exceeds the range of a dipole's fit.
 _NARROWEST, _WIDEST = 0.05, 200.0
-# Spacing of the log variances for which plans are made; a plan is valid over a wider range.
+# Spacing of the log variances for which plans are made. A plan is valid over a wider range.
 _GRID = math.log(1.15)
-# Factor on the range of variances, for starts whose coefficients are off by a factor of three.
+# Extension of the range of variances, for starts whose coefficients are off by a factor of three.
 _REACH = 10.0
 
 
 def make_plans(
     pictured_scenes: Sequence[PicturedScene], material: Material, settings: RenderSettings
 ) -> list[Plan]:
-    """Make a plan for each picture. Pictures share plans where possible, so that nothing is
-    compiled twice.
-    """
+    """Make a plan for each picture. Pictures share plans where possible, to avoid recompilation."""
     keys = [jax.tree.structure((view.camera, view.lights)) for view in pictured_scenes]
     plans = {}
     for key in dict.fromkeys(keys):
@@ -69,19 +67,19 @@ def render_layers(
     plans: list[Plan] | None = None,
     derivative: bool = True,
 ) -> tuple[list[DiffusionBasis], list[Plan]]:
-    """Render the part that does not depend on weights, one picture after the other.
+    """Render the layers, which do not depend on weights, one picture after the other.
 
     **Arguments:**
 
-    - `plans`: plans to use if their capacity suffices.
+    - `plans`: plans to reuse if their capacity suffices.
     - `derivative`: whether variances may differ slightly from those of the material.
 
     **Returns:** the pictures, and their plans.
     """
 
     def render(plans):
-        # Keys are the plan and the lights of a picture: for three or more under the same lights,
-        # the light is computed once. For two, compilation costs more than this saves.
+        # Keys are the plan and the lights of a picture. For three or more pictures under the same
+        # lights, the light is computed once. For two, compilation would cost more than this saves.
         keys = [
             (id(plan), *(leaf.tobytes() for leaf in jax.tree.leaves(jax.device_get(view.lights))))
             for view, plan in zip(pictured_scenes, plans, strict=True)
@@ -104,8 +102,8 @@ def render_layers(
 
     pictures = render(plans) if plans else []
     if not pictures or any(float(picture.overflow) > 0 for picture in pictures):
-        # Variances are rounded to a coarse grid, so that similar materials have plans of the same
-        # shapes, and share a program.
+        # Round variances to a coarse grid, so that similar materials have plans of equal shapes and
+        # share a program.
         variances = jnp.round(jnp.log(material.gaussians.variances) / _GRID) * _GRID
         rounded = SumOfGaussians(jnp.exp(variances), material.gaussians.weights)
         plans = make_plans(pictured_scenes, material.surface_of(rounded), settings)
@@ -114,11 +112,11 @@ def render_layers(
 
 
 def wide_variances(media: Sequence[Medium], splats: Splats) -> Float[Array, " gaussians"]:
-    r"""Choose variances (mm^2) that serve all media near the given ones; each is three times the
-    previous one.
+    r"""Choose variances (mm^2) that serve all media near the given ones, each three times the
+    previous.
 
-    They cover the dipoles of coefficients up to three times as large or as small. None is much
-    wider than the body.
+    They cover the dipoles of coefficients that differ by up to a factor of three. No Gaussian is
+    much wider than the body.
     """
     paths = np.concatenate([1 / np.asarray(medium.sigma_t_prime, np.float64) for medium in media])
     root = np.concatenate([np.asarray(medium.squared_sigma_tr, np.float64) for medium in media])
@@ -133,11 +131,11 @@ def wide_variances(media: Sequence[Medium], splats: Splats) -> Float[Array, " ga
 
 class Unknowns(eqx.Module):
     r"""The layout of the unknowns: log sigma_a of all channels, log sigma_s' of all channels, then
-    the logarithms of the factors on the lights.
+    the logarithms of the factors of the lights.
 
     **Attributes:**
 
-    - `factors`: the factor of each channel of each picture; `count` where it is known.
+    - `factors`: index of the factor of each channel of each picture; `count` if it is known.
     - `count`: number of factors.
     """
 
@@ -174,19 +172,19 @@ def fit_near(
     weights: AbstractWeights,
     rule: AbstractRadialRule,
 ) -> SumOfGaussians:
-    """Fit Gaussians to a profile, starting from given variances near the best ones."""
+    """Fit Gaussians to a profile, starting from variances near the best ones."""
     return fit_gaussians(
         profile, len(near), weights=weights, start=GivenVariances(near), rule=rule, throw=False
     ).gaussians
 
 
 class RecoveryProblem(eqx.Module):
-    """Observed pictures, and the model of pictures as a function of coefficients.
+    """Observed pictures, and a model of them as a function of coefficients.
 
     **Attributes:**
 
     - `pictures`: layers for all materials, restricted to the points in pixels that count.
-    - `counted`: 1 for pixels that count, else 0.
+    - `counted`: 1 for pixels that count, 0 for others.
     - `fit`: computes the Gaussians of a profile. Differentiable.
     """
 
@@ -208,7 +206,7 @@ class RecoveryProblem(eqx.Module):
         loss: AbstractLoss,
         model: AbstractModel,
     ) -> "RecoveryProblem":
-        """Compare rendered pictures with the observed ones, at the pixels that the body fills."""
+        """Make the problem of rendered and observed pictures, at the pixels that the body fills."""
         dtype, background, kept, counted = unknowns.eta.dtype, UnknownBackground(), [], []
         for picture, observed in zip(pictures, evidence, strict=True):
             counted.append(observed.counted(picture.coverage.astype(dtype), background))
@@ -225,7 +223,7 @@ class RecoveryProblem(eqx.Module):
 
     @property
     def pixels(self) -> int:
-        """The number of pixels that count."""
+        """Return the number of pixels that count."""
         return int(sum(np.sum(counted) for counted in self.counted))
 
     def gaussians(self, point: Float[Array, " unknowns"]) -> SumOfGaussians:
@@ -251,11 +249,11 @@ def search(
     problem: RecoveryProblem, start: Float[Array, " unknowns"]
 ) -> tuple[Float[Array, " unknowns"], Float[Array, ""], Int[Array, ""], Bool[Array, ""]]:
     """Minimize the loss from a start by the Levenberg-Marquardt method. Return the end, its loss,
-    the number of steps, and whether it has converged. The loss at the end is finite and not larger
-    than at the start.
+    the number of steps, and whether the search converged. The final loss is finite and not larger
+    than the initial loss.
     """
     tolerance = 1e-4 if start.dtype == jnp.float32 else 1e-7
-    # In units of the start's own residual, so that damping and tolerances mean the same for any
+    # Divide by the norm of the initial residuals, so that damping and tolerances do not depend on
     # noise and number of pixels.
     unit = jnp.sqrt(jnp.sum(problem.residuals(start) ** 2)) + jnp.finfo(start.dtype).tiny
 
@@ -283,9 +281,9 @@ def solution(
     SumOfGaussians,
     tuple[Float[Array, "_ _ channels"], ...],
 ]:
-    """Compute the information that the pictures give at a point: the inverse of the covariance due
-    to noise of the given deviations (Laplace, in the Gauss-Newton approximation). The unknowns are
-    followed, channel by channel, by the logarithms of the widths below which layers are unresolved.
+    """Compute the information of the pictures at a point: the inverse of the covariance due to
+    noise (Laplace, in the Gauss-Newton approximation). The unknowns are followed by the logarithm,
+    for each channel, of the width below which layers are unresolved.
 
     Also return the fraction of the light of each channel in unresolved layers, and the Gaussians
     and the radiance at the point.
@@ -302,7 +300,7 @@ def solution(
     (slopes, of_width), (gaussians, radiance) = jax.jacfwd(residuals, (0, 1), has_aux=True)(
         point, jnp.zeros((), point.dtype)
     )
-    # Every channel has a width of its own.
+    # Each channel has its own width.
     of_widths = of_width[..., None] * jnp.eye(of_width.shape[1], dtype=of_width.dtype)[None]
     slopes = jnp.concatenate([slopes, of_widths], axis=-1)
     light = problem.pictures[0].light

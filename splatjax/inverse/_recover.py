@@ -1,6 +1,4 @@
-"""Coefficients of a material from pictures of a known shape; and a ranking of the pictures to take
-next by the resulting error bars.
-"""
+"""Recovery of coefficients from pictures of a known shape, and a ranking of further pictures."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -53,7 +51,7 @@ from ._recovery import Combination, Recovery, best_and_worst, inverse
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
 _ROUNDS = 8
 _SAME_INDEX = 1e-4
-# Rounds end when no coefficient changes by more than this, or by a tenth of its error bar.
+# Rounds end if no coefficient changes by more than this, or by more than a tenth of its error bar.
 _SETTLED = 1e-3
 
 
@@ -70,46 +68,46 @@ def recover(
     settings: RenderSettings = _FINE,
     progress: Callable[[str, Medium], None] | None = None,
 ) -> Recovery:
-    r"""Find the absorption and reduced scattering of a material from pictures of a known shape.
+    r"""Recover the absorption and reduced scattering of a material from pictures of a known shape.
 
         seen = Observation(picture, camera, lights, deviation=noise)
         recovery = recover([seen], splats, load_medium("skin1"))
         print(recovery.summary())  # coefficients, error bars, and what is not determined
 
     Give a start within a factor of three of both coefficients, or several starts. The error bars
-    assume that shape, lights, camera and model are right; compare `recovery.chi_squared` with 1.
+    assume that shape, lights, camera and model are exact; compare `recovery.chi_squared` with 1.
 
-    The search is a weighted least-squares fit to all pixels at once, with derivatives from the
-    picture back to the coefficients. The expensive layers depend only on the variances of the
-    Gaussians, and are rendered once for many Levenberg-Marquardt steps. First the variances are
-    fixed (`wide_variances`). Each further round fits `count` Gaussians to the coefficients found so
-    far, renders their layers and the derivatives of the layers with respect to the variances, and
-    searches again, until a round changes nothing.
+    The search is a weighted least-squares fit to all pixels at once, which differentiates the
+    pictures with respect to the coefficients. The expensive layers depend only on the variances of
+    the Gaussians, and are rendered once for many Levenberg-Marquardt steps. In the first round the
+    variances are fixed (`wide_variances`). Each further round fits `count` Gaussians to the current
+    coefficients, renders their layers and the derivatives with respect to the variances, and
+    searches again, until the coefficients no longer change.
 
     **Arguments:**
 
     - `observations`: one or more.
     - `splats`: the splats of the body, mm. Their albedo is assumed known; without albedo the
-      coefficients alone give the color.
-    - `starts`: starts of the search; their `eta` is assumed known and must be the same. If there
-      are several, only the search with the least loss is continued.
-    - `surface`: a material of known specular strength and roughness, and of the same index as the
+      coefficients alone determine the color.
+    - `starts`: starts of the search, with equal, known `eta`. Only the search with the least loss
+      is continued.
+    - `surface`: a material with the known specular strength and roughness, and the index of the
       starts; its Gaussians are not used. By default there is no specular lobe.
     - `model`: `TransportModel()`, by default, or `DiffusionModel()`, the classical dipole.
-    - `count`: number of Gaussians; `weights`: the constraint of their weights, by default
-      non-negative and with a fixed sum, as in the library.
-    - `loss`: `SquaredLoss()`, or `HuberLoss()` where the model does not explain some pixels.
-    - `settings`: settings of the renderer. By default the layers are eight times more accurate than
-      in `render`: an error of 0.1% in a picture of a bright material is one of 2% in absorption.
+    - `count`: number of Gaussians; `weights`: the constraint on their weights, by default
+      non-negative with a fixed sum, as for the materials of the library.
+    - `loss`: `SquaredLoss()`, or `HuberLoss()` if the model does not explain some pixels.
+    - `settings`: settings of the renderer, by default with layers eight times more accurate than in
+      `render`: an error of 0.1% in a picture of a bright material is one of 2% in absorption.
     - `progress`: called with a description of each stage, and the best medium so far.
 
-    **Returns:** a `Recovery` in JAX's default precision: `jax.enable_x64` resolves small errors,
-    and does not change the pictures. If the rounds have not converged, it is the recovery of the
-    round with the least loss, with its error bars, and `result` and a `RuntimeWarning` report it.
-    To continue, start from its `medium`.
+    **Returns:** a `Recovery` in JAX's default precision; `jax.enable_x64` resolves small errors. If
+    the rounds do not converge, it is the recovery of the round with the least loss, which `result`
+    and a `RuntimeWarning` report. To continue, start from its `medium`.
 
-    **Raises:** `ValueError` for no observation or start, channels that disagree, starts without
-    absorption, different indices of surface and starts, and a picture without pixels that count.
+    **Raises:** `ValueError` without observations or starts, for unequal numbers of channels, for
+    starts without absorption, for different indices of surface and starts, and for a picture
+    without pixels that count.
     """
     dtype, observations = jnp.result_type(float), list(observations)
     starts = [
@@ -197,7 +195,7 @@ def recover(
     assert best is not None
     if not settled:
         warnings.warn(
-            f"the coefficients still changed in the last round ({rounds}), and this is the "
+            f"the coefficients still changed in the last round ({rounds}), so this is the "
             "round with the least loss; start from its medium to continue",
             RuntimeWarning,
             stacklevel=2,
@@ -237,7 +235,7 @@ def _check(observations: list[Observation], splats, starts: list[Medium], surfac
 
 
 def _unweighed(variances: Float[Array, " gaussians"], channels: int) -> SumOfGaussians:
-    """Make Gaussians whose weights are still unknown."""
+    """Make Gaussians with placeholder weights."""
     return SumOfGaussians(variances, jnp.zeros((len(variances), channels), variances.dtype))
 
 
@@ -247,8 +245,8 @@ class Prediction(eqx.Module):
     **Attributes:**
 
     - `candidate`: the picture.
-    - `covariance`: covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each channel,
-      with this picture.
+    - `covariance`: covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each channel
+      if this picture is added.
     """
 
     candidate: Candidate
@@ -256,7 +254,7 @@ class Prediction(eqx.Module):
 
     @property
     def worst(self) -> Combination:
-        """The combination with the largest error in any channel."""
+        """Return the combination with the largest error in any channel."""
         worst = (best_and_worst(covariance)[1] for covariance in self.covariance)
         return max(worst, key=lambda combination: combination.deviation)
 
@@ -272,23 +270,25 @@ def next_pictures(
     *,
     settings: RenderSettings = RenderSettings(),
 ) -> list[Prediction]:
-    r"""Rank candidate pictures by the error bars of the coefficients after taking each of them.
+    r"""Rank candidate pictures by the error bars that the coefficients would have with each
+    picture.
 
-    Each is rendered once with the recovered material, and differentiated. Its noise is the same
-    fraction of its brightness as in the earlier pictures. Information adds up, and its inverse is
-    the covariance.
+    Each candidate is rendered once with the recovered material and differentiated. Its noise,
+    relative to its brightness, is that of the earlier pictures. The covariance is the inverse of
+    the summed information.
 
     **Arguments:**
 
     - `recovery`: the recovery from the earlier pictures; its model and weights are used.
     - `splats`: the splats of the body.
     - `candidates`: at least one; see `default_candidates`.
-    - `settings`: settings of the renderer, by default the same as for `render`: a prediction needs
+    - `settings`: settings of the renderer, by default those of `render`, since a prediction needs
       less accurate layers than a search.
 
-    **Returns:** the predictions, sorted by the error of their worst combination, the least first.
+    **Returns:** the predictions, in ascending order of the error of their worst combination.
 
-    **Raises:** `ValueError` for no candidate, and for one in which the body is not visible.
+    **Raises:** `ValueError` without candidates, and for a candidate in which the body is not
+    visible.
     """
     candidates = list(candidates)
     require(candidates, "candidates is empty; give some, or default_candidates(splats, camera)")
@@ -318,10 +318,10 @@ def next_pictures(
 
 
 def _marginal(information: np.ndarray, channels: int, size: int) -> np.ndarray:
-    """Eliminate the factors of a picture from its information about coefficients and the transition
-    to unresolved layers, and add zeros for the factors of other pictures.
+    """Eliminate the factors of a picture from its information about coefficients and unresolved
+    widths, and add zeros for the factors of other pictures.
     """
-    kept = np.r_[: 2 * channels, -channels:0]  # whatever the number of factors between them
+    kept = np.r_[: 2 * channels, -channels:0]  # without the factors between them
     factors = np.arange(2 * channels, len(information) - channels)
     mixed = information[np.ix_(kept, factors)]
     pseudo_inverse = np.linalg.pinv(information[np.ix_(factors, factors)])

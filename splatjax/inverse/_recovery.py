@@ -1,6 +1,4 @@
-"""Results of one or several recoveries: coefficients with error bars, and their undetermined
-combinations.
-"""
+"""Results of recoveries: coefficients with error bars, and their undetermined combinations."""
 
 import abc
 from collections.abc import Sequence
@@ -32,8 +30,8 @@ class Combination(eqx.Module):
 
     **Attributes:**
 
-    - `powers`: p and q, the larger of which is 1. Static.
-    - `deviation`: standard deviation of its logarithm: its relative error, where it is small.
+    - `powers`: p and q; the larger is 1. Static.
+    - `deviation`: standard deviation of the logarithm, which is the relative error if it is small.
       Static.
     """
 
@@ -48,14 +46,14 @@ class Combination(eqx.Module):
 
 
 class AbstractEstimate(eqx.Module):
-    """Coefficients, `medium` (1/mm), and their errors."""
+    """Coefficients (`medium`, 1/mm) and their errors."""
 
     medium: Medium
 
     @abc.abstractmethod
     def covariance(self) -> Float[np.ndarray, "channels 2 2"]:
-        """Return the covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each channel;
-        infinite where they are unknown.
+        """Compute the covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each
+        channel. It is infinite where they are unknown.
         """
 
     def relative_errors(
@@ -66,17 +64,17 @@ class AbstractEstimate(eqx.Module):
         return deviations[:, 0], deviations[:, 1]
 
     def combinations(self) -> list[tuple[Combination, Combination]]:
-        """Find, for each channel, the combination of coefficients with the least error and the one
-        with the largest.
+        """Find, for each channel, the combinations of coefficients with the least and the largest
+        error.
         """
         return [best_and_worst(covariance) for covariance in self.covariance()]
 
     def summary(self, channels: Sequence[str] | None = None) -> str:
-        """Format the coefficients, their errors, and what is not determined.
+        """Format the coefficients, their errors, and undetermined combinations.
 
         **Arguments:**
 
-        - `channels`: their names; by default red, green and blue, or numbers.
+        - `channels`: names of the channels; by default red, green and blue, or numbers.
         """
         return "\n".join(line for lines in self.lines(channels) for line in lines)
 
@@ -100,7 +98,7 @@ class AbstractEstimate(eqx.Module):
 
 
 class Estimate(AbstractEstimate):
-    """Coefficients and the covariance of their logarithms, as `combined` returns them."""
+    """The coefficients and the covariance of their logarithms that `combined` computes."""
 
     covariance_of_logarithms: Float[np.ndarray, "channels 2 2"]
 
@@ -115,7 +113,7 @@ def best_and_worst(covariance: Float[np.ndarray, "2 2"]) -> tuple[Combination, C
     values, axes = np.linalg.eigh(covariance)
     largest = np.take_along_axis(axes, np.argmax(np.abs(axes), axis=0)[None], axis=0)
     axes = axes / largest
-    # The larger power is 1, and the power of sigma_a is positive unless it is tiny.
+    # Scale the larger power to 1, and make the power of sigma_a positive unless it is tiny.
     axes = np.where((axes[0] > 0.05) | (axes[1] > 0.95), axes, -axes)
     deviations = np.sqrt(np.maximum(values, 0.0))
     best, worst = (
@@ -128,12 +126,12 @@ def best_and_worst(covariance: Float[np.ndarray, "2 2"]) -> tuple[Combination, C
 def inverse(
     information: Float[np.ndarray, "unknowns unknowns"],
 ) -> Float[np.ndarray, "unknowns unknowns"]:
-    """Invert information to a covariance; infinite where an unknown has no information."""
+    """Invert information to a covariance, which is infinite for unknowns without information."""
     lengths = np.sqrt(np.diagonal(information))
     if not np.all(np.isfinite(information)) or np.any(lengths == 0):
         return np.full_like(information, np.inf)
     values, axes = np.linalg.eigh(information / np.outer(lengths, lengths))
-    # Rounding gives small spurious information along directions of no change.
+    # Rounding gives a little spurious information along directions of no change.
     values = np.maximum(values, np.finfo(np.float64).eps * len(values))
     return (axes / values) @ axes.T / np.outer(lengths, lengths)
 
@@ -143,53 +141,50 @@ def _power(name: str, power: float) -> str:
 
 
 # Standard deviation of the logarithm of the width below which a layer is unresolved. Doubling the
-# number of splats changes the logarithm by as much; regularly spaced splats have a width 2.5 times
-# smaller than scattered ones.
+# number of splats changes the logarithm by the same amount. The width is 2.5 times smaller for
+# regularly spaced splats than for scattered splats.
 _RESOLUTION = 0.5 * np.log(2.0)
-# Chi-squared per degree of freedom above which the model is incomplete.
+# Chi-squared per degree of freedom above which the model counts as incomplete.
 _TOO_LARGE = 1.5
-# Fraction of unresolved light above which the width of the profile is hardly determined: marble on
+# Fraction of unresolved light above which the width of the profile is hardly determined. Marble on
 # a head of 100,000 splats has 0.6 and is recovered within 1.4%; the blue channel of skin has 1.0
-# and is not.
+# and is not recovered.
 _MOST = 0.8
 
 
 class Recovery(AbstractEstimate):
-    r"""The most likely material, and how well the pictures determine it.
+    r"""The most likely material, and its uncertainty.
 
-        print(recovery.summary())  # coefficients, error bars, and what is not determined
+        print(recovery.summary())  # coefficients, error bars, undetermined combinations
         of_sigma_a, of_sigma_s_prime = recovery.relative_errors()  # standard deviations
 
     **Attributes:**
 
-    - `medium`: its coefficients, 1/mm.
-    - `material`: its Gaussians, with the known surface.
-    - `intensities`: factors on the light of each picture; 1 where the light was known.
-    - `information`: inverse of the covariance due to the given noise. Its rows are logarithms: of
-      `sigma_a` of each channel, of `sigma_s_prime` of each channel, of the unknown factors on the
-      light, and of the width below which the splats do not resolve a layer, for each channel.
+    - `medium`: the coefficients, 1/mm.
+    - `material`: the Gaussians with the known surface.
+    - `intensities`: factors of the light of each picture; 1 where the light is known.
+    - `information`: inverse of the covariance due to noise. The unknowns are the logarithms of
+      `sigma_a` of each channel, of `sigma_s_prime` of each channel, of the unknown factors of the
+      light, and, for each channel, of the width below which the splats do not resolve a layer.
     - `unresolved`: the fraction of the light of each channel that spreads less than the spacing of
-      the splats. A picture determines how much light this is, not how far it travels.
-    - `chi_squared`: sum of the squares of residuals divided by the noise, per degree of freedom.
-      About 1 if model and noise are right; far above, the model is incomplete, and error bars are
-      too small.
-    - `noise_is_known`: whether all pictures have deviations; if not, error bars follow from the
-      residuals. Static.
+      the splats. A picture determines the amount of this light, but not how far it travels.
+    - `chi_squared`: sum of squared residuals, in units of the noise, per degree of freedom. It is
+      about 1 if model and noise are right. If it is much larger, the model is incomplete and the
+      error bars are too small.
+    - `noise_is_known`: whether all pictures have deviations; otherwise error bars are computed from
+      the residuals. Static.
     - `relative_noise`: deviation of a typical pixel divided by the brightness of its picture.
       Static.
-    - `pictures`: rendered with the coefficients; NaN where a pixel does not count.
+    - `pictures`: pictures rendered with the coefficients; NaN where a pixel does not count.
     - `residuals`: rendered minus observed pictures.
-    - `ends`, `costs`: the end of the search from each start in the first round, and the sum of its
-      losses.
+    - `ends`, `costs`: the end of the search from each start in the first round, and its total loss.
     - `steps`, `rounds`: number of steps of all searches, and of rounds. Static.
-    - `model`, `weights`: the model of the profile, and the constraint on its weights, used in the
-      search.
+    - `model`, `weights`: the model of the profile, and the constraint on the weights.
     - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
 
-    Error bars assume that model and shape are right and that the noise of pixels is independent:
-    they describe precision, not accuracy. They include the error of unresolved layers: the width
-    below which layers are unresolved is assumed known to a factor of 1.4, and the change of the
-    coefficients that this factor causes is part of the bars.
+    Error bars assume that model and shape are exact and that the noise of pixels is independent;
+    they describe precision, not accuracy. They include the uncertainty of unresolved layers: the
+    width below which layers are unresolved is assumed known to a factor of 1.4.
     """
 
     material: Material
@@ -211,7 +206,7 @@ class Recovery(AbstractEstimate):
 
     @property
     def scale(self) -> float:
-        """The factor on the covariance of the given noise."""
+        """Return the factor of the covariance due to noise."""
         return 1.0 if self.noise_is_known else float(self.chi_squared)
 
     def covariance(
@@ -221,33 +216,32 @@ class Recovery(AbstractEstimate):
         stretch: float = 1.0,
     ) -> Float[np.ndarray, "channels 2 2"]:
         """Compute the covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each
-        channel, marginalized over the other unknowns.
+            channel, marginalized over the other unknowns.
 
-        It has two parts: the covariance due to noise, and the square of the change of the
-        coefficients if the width below which layers are unresolved is off by one standard deviation
-        (`resolution`).
+            It is the sum of the covariance due to noise and the square of the change of the
+            coefficients if the width below which layers are unresolved changes by one standard
+            deviation (`resolution`).
 
-        **Arguments:**
+            **Arguments:**
 
-        - `more`: information that another picture would add.
-        - `resolution`: the deviation of the logarithm of the width below which a layer is
-          unresolved; 0 for an exact one.
-        - `stretch`: a factor on the covariance of the noise.
+            - `more`: information that another picture would add.
+            - `resolution`: the standard deviation of the logarithm of that width; 0 if exact.
+        - `stretch`: factor of the covariance due to noise.
         """
         channels, scale = self.medium.channels, max(self.scale * stretch, np.finfo(float).tiny)
         information = np.asarray(self.information, np.float64) / scale + more
         unknowns = len(information) - channels
         covariance = inverse(information[:unknowns, :unknowns])
         if np.all(np.isfinite(covariance)):
-            # The width is not searched: information about it helps no unknown.
+            # The width is not searched, so information about it does not help other unknowns.
             astray = covariance @ information[:unknowns, unknowns:] * resolution
             covariance = covariance + astray @ astray.T
         pairs = np.arange(channels)[:, None] + [0, channels]
         return covariance[pairs[:, :, None], pairs[:, None]]
 
     def noise_errors(self) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
-        """Compute the errors due to noise alone: the scatter of searches if the pictures were taken
-        again.
+        """Compute the errors due to noise alone: the scatter of the results if the pictures were
+        retaken.
         """
         return Estimate(self.medium, self.covariance(resolution=0.0)).relative_errors()
 
@@ -257,11 +251,11 @@ class Recovery(AbstractEstimate):
             if unresolved > _MOST:
                 of_channel.append(
                     f"  {percent(unresolved)} of its light spreads less than the spacing of "
-                    "the splats, so its width is hardly determined; take more splats, or a "
+                    "the splats, so its width is hardly determined; use more splats or a "
                     "closer picture"
                 )
         if not self.noise_is_known:
-            lines.append(["error bars follow from the residuals, with independent pixels"])
+            lines.append(["error bars are computed from the residuals, with independent pixels"])
         elif float(self.chi_squared) > _TOO_LARGE:
             noise = f"{float(self.chi_squared) ** 0.5:.2g} times the noise"
             lines.append(
@@ -274,23 +268,23 @@ class Recovery(AbstractEstimate):
 
 
 def combined(recoveries: Sequence[Recovery]) -> Estimate:
-    r"""Combine recoveries from separate pictures: the mean of the logarithms, weighted by their
+    r"""Combine recoveries from separate pictures by the mean of the logarithms, weighted by their
     information.
 
-    A search of all pictures at once weights their pixels by noise alone. Many pixels with
-    unresolved layers, which do not show how far light travels, then outweigh the few that do. In
-    separate searches, the error bars of each picture give the combination of coefficients that it
-    determines, and only that is used: a coarse picture of a body for the reflectance, a close one
-    under a laser dot for the distance.
+    A search over all pictures at once weights their pixels by noise alone. Many pixels with
+    unresolved layers, which do not show how far light travels, then outweigh the few that do. With
+    separate searches, each picture only contributes the combination of coefficients that it
+    determines: a coarse picture of a body the reflectance, a close picture under a laser dot the
+    distance.
 
     **Arguments:**
 
-    - `recoveries`: of one material, with independent errors. If residuals exceed the noise, the
-      error bars of a recovery are scaled by the root of its `chi_squared`.
+    - `recoveries`: recoveries of one material with independent errors. If residuals exceed the
+      noise, the error bars of a recovery are scaled by the square root of its `chi_squared`.
 
     **Returns:** an `Estimate`.
 
-    **Raises:** `ValueError` for no recovery, and for channels or indices of refraction that differ.
+    **Raises:** `ValueError` without recoveries, and for unequal numbers of channels or indices.
     """
     require(recoveries, "recoveries is empty; give at least one")
     eta = recoveries[0].medium.eta
@@ -317,7 +311,7 @@ def combined(recoveries: Sequence[Recovery]) -> Estimate:
 
 
 def _stretched_information(recovery: Recovery) -> Float[np.ndarray, "channels 2 2"]:
-    """Invert the covariance of each channel; residuals above the noise count as noise."""
+    """Invert the covariance of each channel. Residuals above the noise count as noise."""
     stretch = max(float(recovery.chi_squared), 1.0) if recovery.noise_is_known else 1.0
     covariance = recovery.covariance(stretch=stretch)
     is_known = np.all(np.isfinite(covariance), axis=(1, 2))[:, None, None]

@@ -1,5 +1,5 @@
-"""Maps over the surface, blurred by a Gaussian mean over the neighbors of each splat: offsets along
-the normals, and parameters of the material, such as melanin and blood.
+"""Smooth maps over the surface: offsets along the normals, and parameters of the material such as
+melanin and blood.
 """
 
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy  # its parts are loaded where they are used, which takes a third of a second
+import scipy  # submodules load on first use, which takes a third of a second
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import jit_unless_traced
@@ -22,10 +22,10 @@ from ._observation import PicturedScene
 from ._parts import BOUNDED, AbstractPart
 
 _REACH = 2.5  # reach of the blur, standard deviations
-_SLOPES = 17  # splats used to measure a slope, including the splat itself
-_ROUNDED = 16  # neighbor counts are rounded up to multiples, so that similar bodies share a program
+_SLOPES = 17  # number of splats to measure a slope, including the splat itself
+_ROUNDED = 16  # neighbor counts are multiples of this, so that similar bodies share a program
 _SAME_SIDE = 0.3  # least cosine between normals of splats that belong together
-_SAME = 1e-5  # relative, between the Gaussians of a table and those of the material
+_SAME = 1e-5  # relative difference between the Gaussians of a table and those of the material
 
 
 class SurfaceMean(eqx.Module):
@@ -33,8 +33,8 @@ class SurfaceMean(eqx.Module):
 
     **Attributes:**
 
-    - `near`: the neighbors; those out of reach or on another side have weight 0.
-    - `gain`: root mean square of the means of independent noise of deviation 1.
+    - `near`: the neighbors; neighbors out of reach or on another side have weight 0.
+    - `gain`: root mean square of the mean of independent noise with deviation 1.
     """
 
     near: Int[Array, "splats _near"]
@@ -43,7 +43,7 @@ class SurfaceMean(eqx.Module):
 
     @classmethod
     def of(cls, splats: Splats, width: float) -> "SurfaceMean":
-        """Find the neighbors of splats for a standard deviation, mm."""
+        """Find the neighbors of splats for a blur with a standard deviation in mm."""
         fields = (splats.centers, splats.normals, splats.areas)
         centers, normals, areas = (np.asarray(field, np.float64) for field in fields)
         tree = scipy.spatial.KDTree(centers)
@@ -67,7 +67,9 @@ class SurfaceMean(eqx.Module):
 
 
 class OffsetTables(eqx.Module):
-    """The mean of offsets, the neighbors of each splat, and weights of sums over them."""
+    """The mean of offsets, the neighbors of each splat, and the weights for derivatives over
+    them.
+    """
 
     mean: SurfaceMean
     around: Int[Array, "splats _around"]  # neighbors from which slopes are computed
@@ -77,25 +79,25 @@ class OffsetTables(eqx.Module):
 
 
 class NormalOffsets(AbstractPart):
-    r"""A displacement map: the offset of each splat along its initial normal.
+    r"""A displacement map, the offset of each splat along its initial normal.
 
         part = NormalOffsets(step=0.02, smoothness=0.9, deviation=0.4)  # mm
 
-    Independent offsets of neighboring splats would produce noise and holes, so the coordinates `x`
+    Independent offsets of neighboring splats would cause noise and holes, so the coordinates `x`
     are blurred over the surface:
 
         offset = step blur(x),   center = start + offset normal
 
     The blur is a mean over the surface with Gaussian weights, so no offset exceeds `step` times the
     largest coordinate nearby. Normals, areas and radii follow the displaced surface. A splat
-    farther than 2.5 `smoothness` from all visible ones does not move.
+    farther than 2.5 `smoothness` from all visible splats does not move.
 
     **Attributes:** (static)
 
     - `step`: offset for a coordinate of 1, mm.
-    - `smoothness`: standard deviation of the blur, mm; choose a few spacings of the splats. Finer
-      bumps are not found.
-    - `deviation`: expected size of an offset, one standard deviation of a normal prior, mm.
+    - `smoothness`: standard deviation of the blur, mm, usually a few spacings of the splats. Finer
+      bumps are not recovered.
+    - `deviation`: standard deviation of the normal prior of an offset, mm.
     """
 
     shared = True
@@ -129,7 +131,7 @@ class NormalOffsets(AbstractPart):
         splats = pictured.splats
         shifts = self.step * prepared.mean(x[:, None]) * splats.normals
         apart = shifts[prepared.around] - shifts[:, None]
-        # The initial tangents, tilted by the slopes of the offsets along them.
+        # Tilt the initial tangents by the slopes of the offsets along them.
         along = prepared.tangents + jnp.sum(prepared.slopes[..., None] * apart[:, :, None], axis=1)
         across = jnp.cross(along[:, 0], along[:, 1])
         stretch = jnp.sqrt(jnp.sum(across * across, axis=1))
@@ -145,8 +147,8 @@ class NormalOffsets(AbstractPart):
 
 
 def _slopes(centers: np.ndarray, normals: np.ndarray):
-    """Find neighbors, tangents, and the weights of derivatives along them: least squares with
-    quadratic terms.
+    """Find neighbors, tangents, and weights for derivatives along the tangents, by least squares
+    with quadratic terms.
     """
     around = scipy.spatial.KDTree(centers).query(centers, k=_SLOPES, workers=-1)[1][:, 1:]
     tangents = np.stack(tangent_frames(normals), axis=1)
@@ -162,8 +164,8 @@ def _slopes(centers: np.ndarray, normals: np.ndarray):
 
 
 class MapTables(eqx.Module):
-    """The table in the precision of the splats, the mean over neighbors, the logits of the start,
-    and the change of logits per coordinate.
+    """The table in the precision of the splats, the mean over neighbors, the initial logits, and
+    the change of logits per coordinate.
     """
 
     table: WeightTable
@@ -173,32 +175,33 @@ class MapTables(eqx.Module):
 
 
 class ParameterMap(AbstractPart):
-    r"""The parameters of the material at every splat, within the range of a table, no finer than
+    r"""The material parameters at every splat, within the range of a table and no finer than
     `smoothness`.
 
         fraction = 1 / (1 + exp(-(logit(start) + blur(B x))))
 
     The fraction is the position of a value in the range of its parameter, on the parameter's scale.
-    The blur is a Gaussian mean over the surface. `B` is the inverse root of `J^T J / step^2 + 1 /
-    deviation^2`, where `J` contains the derivatives, at the start and with respect to the logits,
-    of the reflectance of a flat surface, divided by its mean over the channels. One coordinate
-    therefore changes the color by about one step, in directions that are independent where
-    parameters have similar effects. A splat farther than 2.5 `smoothness` from all visible ones
-    keeps its start.
+    The blur is a Gaussian mean over the surface. `B` is the inverse square root of
+    `J^T J / step^2 + 1 / deviation^2`, where `J` contains the derivatives, at the start, of the
+    reflectance of a flat surface with respect to the logits, divided by the mean of the reflectance
+    over the channels. A unit change of a coordinate therefore changes the color by about one step,
+    and the coordinates are independent even if parameters have similar effects. A splat farther
+    than 2.5 `smoothness` from all visible splats keeps its start.
 
-    The part replaces `Splats.weights`. An albedo of the same splats must be known.
+    The part replaces `Splats.weights`. If the splats have an albedo, it must be known.
 
     **Attributes:**
 
-    - `table`: the factors of the parameters, on the Gaussians of the material.
-    - `start`: values of each parameter by its name, one for each splat or one for all.
-    - `smoothness`: standard deviation of the blur, mm. Static. If it is wider than half the spacing
-      of the splats, maps become smoother, and fits slower.
-    - `deviation`: expected distance of a logit from its start, one standard deviation of a normal
-      prior; 2 covers nearly the whole range. Static.
+    - `table`: the factors of the weights as a function of the parameters, for the Gaussians of the
+      material.
+    - `start`: values of each parameter by name, one per splat or one for all.
+    - `smoothness`: standard deviation of the blur, mm. Static. Above half the spacing of the
+      splats, maps become smoother and fits slower.
+    - `deviation`: standard deviation of the normal prior of a logit about its start; 2 covers
+      nearly the whole range. Static.
     - `step`: relative change of the color for a coordinate of 1. Static.
 
-    **Raises:** `ValueError` for parameters of other names, and for a start outside of the table.
+    **Raises:** `ValueError` for other names of parameters, and for a start outside the table.
     """
 
     shared = True
@@ -268,7 +271,9 @@ def _changes(x: Float[Array, "splats parameters"], prepared: MapTables):
 def _reflectance_slopes(
     table: WeightTable, logits: Float[Array, "splats parameters"]
 ) -> Float[Array, "splats channels parameters"]:
-    """Differentiate the reflectance with respect to the logits, and divide by its mean."""
+    """Differentiate the reflectance with respect to the logits, and divide by its mean over
+    channels.
+    """
 
     def reflectance(logits):
         return table.reflectance(jax.nn.sigmoid(logits)[None])[0]

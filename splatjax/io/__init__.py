@@ -1,4 +1,4 @@
-"""Reads and writes files of splats, meshes, pictures and materials."""
+"""Reading and writing of splats, meshes, pictures, scenes and materials."""
 
 from splatjax._display import (
     linear_to_srgb as linear_to_srgb,

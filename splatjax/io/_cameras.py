@@ -1,4 +1,4 @@
-"""Cameras of files: transforms.json of NeRF and instant-ngp, COLMAP, and glTF."""
+"""Cameras from files: transforms.json of NeRF and instant-ngp, COLMAP, and glTF."""
 
 import json
 import struct
@@ -24,10 +24,11 @@ _Rows: TypeAlias = tuple[Sequence[Sequence[Any]], Sequence[Sequence[Any]]]
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
 _DISTORTED = "with distortion; undistort the pictures first, such as by `colmap image_undistorter`"
 _SQUARE = 1e-2  # largest error at the edge of a picture due to unequal focal lengths, pixels
-_ROWS = 512  # rows of a picture, because glTF does not specify its size
+_ROWS = 512  # rows of the picture, because glTF does not specify its size
 _LIGHTS = "KHR_lights_punctual"
 _SHEAR = 1e-3  # relative difference of the scales of axes
-# COLMAP's models with their parameters, ordered by its model numbers; all others have distortion.
+# COLMAP's models with their parameters, in the order of its model numbers; all other models have
+# distortion.
 _MODELS = {
     "SIMPLE_PINHOLE": ("fl_x", "cx", "cy"),
     "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
@@ -49,13 +50,13 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
     **Arguments:**
 
     - `mm_per_unit`: length of the file's unit, mm. Reconstructions from pictures have an arbitrary
-      unit, which their splats or mesh share.
+      unit, shared by their splats or mesh.
     - `up`: the file's upward axis, `"y"` or `"z"`; cameras have +y up.
 
     **Returns:** cameras by name, in the order of the file.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or has no camera,
-    and for lenses with distortion, pixels that are not square, and axes that are not orthogonal.
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read or has no camera,
+    and for lenses with distortion, pixels that are not square, or axes that are not orthogonal.
     """
     path, cameras = Path(path), {}
     check_units(path, mm_per_unit, up)
@@ -75,7 +76,7 @@ def load_cameras(path: StrPath, *, mm_per_unit: float, up: str = "y") -> dict[st
 
 
 def load_camera(path: StrPath, name: str = "0", *, mm_per_unit: float, up: str = "y") -> Camera:
-    """Read one of the cameras of a file (`load_cameras`), by its name or its number from 0."""
+    """Read one camera of a file (see `load_cameras`), given by its name or its number from 0."""
     cameras = load_cameras(path, mm_per_unit=mm_per_unit, up=up)
     names = {str(number): key for number, key in enumerate(cameras)} | {n: n for n in cameras}
     expect(
@@ -88,16 +89,16 @@ def load_camera(path: StrPath, name: str = "0", *, mm_per_unit: float, up: str =
 
 
 def resized(camera: Camera, height: int) -> Camera:
-    """Return a camera with another number of rows, and columns in proportion."""
+    """Return a camera with another number of rows and a proportional number of columns."""
     return replace(camera, width=round(camera.width * height / camera.height), height=height)
 
 
 def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -> Camera:
-    """Make a camera from a lens and a pose: the transformation to the world from the axes right,
-    down and forward.
+    """Make a camera from a lens and a pose, the transformation from the axes right, down and
+    forward to the world.
 
-    The lens has the entries of instant-ngp: w, h, fl_x, fl_y, cx and cy, in pixels; the last three
-    are optional.
+    The lens has the entries of instant-ngp: w, h, fl_x, fl_y, cx and cy in pixels, the last three
+    optional.
     """
     model = lens.get("camera_model", "PINHOLE")
     bent = [f"{name} = {lens[name]}" for name in _DISTORTION if lens.get(name)]
@@ -116,7 +117,7 @@ def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -
     expect(
         abs(focal_x / focal_y - 1) * width < 2 * _SQUARE,
         where,
-        f"fl_x is {focal_x:g} and fl_y is {focal_y:g}, of pixels that are not square; "
+        f"fl_x is {focal_x:g} and fl_y is {focal_y:g}, so pixels are not square; "
         "reconstruct with one focal length, such as SIMPLE_PINHOLE",
     )
     left, scales, right = np.linalg.svd(pose[:3, :3])
@@ -143,7 +144,7 @@ def _transforms(path: Path) -> _Found:
         lens = content | frame
         if lens.keys() >= {"w", "camera_angle_x"}:
             lens.setdefault("fl_x", 0.5 * lens["w"] / np.tan(0.5 * lens["camera_angle_x"]))
-        # The file's axes are right, up and back.
+        # The axes of the file are right, up and back.
         pose = np.asarray(frame["transform_matrix"], float) * [1, -1, -1, 1]
         yield frame.get("file_path", str(index)), lens, pose
 
@@ -166,7 +167,7 @@ def _colmap(path: Path) -> _Found:
 
 def _colmap_text(path: Path) -> _Rows:
     cameras = [line.split() for line in _lines(path / "cameras.txt")]
-    # The lines between those of images list the points of each image.
+    # Every other line lists the points of an image.
     return cameras, [line.split(maxsplit=9)[1:] for line in _lines(path / "images.txt")[::2]]
 
 
@@ -210,12 +211,14 @@ def _gltf(path: Path) -> _Found:
             yield name, pixels, matrix * [1, -1, -1, 1]
         else:
             warnings.warn(
-                f"{path}: the camera {name!r} is {camera['type']}, and is left out", stacklevel=2
+                f"{path}: the camera {name!r} is {camera['type']}, and is omitted", stacklevel=2
             )
 
 
 def gltf_nodes(path: Path, kind: str) -> _Found:
-    """Yield name, contents and transformation to the world of all nodes with a camera or light."""
+    """Yield the name, contents and transformation to the world of each node with a camera or
+    light.
+    """
     from trimesh.transformations import quaternion_matrix, translation_matrix  # takes a second
 
     data = path.read_bytes()

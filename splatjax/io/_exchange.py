@@ -1,4 +1,4 @@
-"""What glTF and USD have in common, in meters: the body as triangles, and the places of lights and
+"""Common parts of glTF and USD, in meters: the body as triangles, and the poses of lights and
 cameras.
 """
 
@@ -13,8 +13,8 @@ _CORNERS = 6  # corners of the polygon that replaces a disc
 
 
 def body_mesh(splats: Splats, mesh: Mesh | None) -> Mesh:
-    """Return the body as triangles: a hexagon in the disc of each splat, or a mesh with the albedo
-    of the nearest splat at each vertex.
+    """Return the body as triangles: a hexagon per splat, or the given mesh with the albedo of the
+    nearest splat at each vertex.
     """
     from scipy.spatial import KDTree  # takes a third of a second
 
@@ -39,14 +39,14 @@ def body_mesh(splats: Splats, mesh: Mesh | None) -> Mesh:
 
 
 def camera_pose(camera: Camera) -> Float[np.ndarray, "4 4"]:
-    """Return the transformation to the world from the axes of a camera: right, up and back."""
+    """Compute the transformation from the axes of a camera (right, up and back) to the world."""
     axes = np.asarray(camera.rotation, float) * np.asarray([1, -1, -1])[:, None]
     return _pose(axes, camera.position)
 
 
 def light_pose(light: AbstractLight) -> Float[np.ndarray, "4 4"]:
-    """Return the transformation to the world from the axes of a light, which shines along -z, or
-    from the axes of an environment's image.
+    """Compute the transformation to the world from the axes of a light that shines along -z, or of
+    the image of an environment.
     """
     if isinstance(light, RectangleLight):
         along, across = unit(np.asarray(light.edges, float))
@@ -61,9 +61,7 @@ def light_pose(light: AbstractLight) -> Float[np.ndarray, "4 4"]:
 
 
 def strength(light: AbstractLight) -> tuple[float, list[float]]:
-    """Return a light's strength in its brightest channel, and its color: all strengths divided by
-    this.
-    """
+    """Return the strength of a light in its brightest channel, and its color relative to that."""
     values = np.broadcast_to(np.asarray(getattr(light, light.strength_field), float), 3)
     greatest = float(values.max())
     return greatest, (values / (greatest or 1.0)).tolist()

@@ -1,5 +1,5 @@
-"""Checks before a file is opened (existence, unit), atomic writing, JSON records of the settings of
-a file, and records as tables of plain numbers.
+"""Checks of paths and units, atomic writing, JSON records, and conversion of records to tables of
+plain numbers.
 """
 
 import dataclasses
@@ -22,15 +22,15 @@ StrPath: TypeAlias = str | os.PathLike[str]
 
 
 def expect(holds: Any, where: StrPath, fault: str) -> None:
-    """Raise `ValueError` with a file, or a place in it, and its fault, unless a condition holds."""
+    """Raise `ValueError` with a file, or a place in it, and the fault unless a condition holds."""
     if not holds:
         raise ValueError(f"{where}: {fault}")
 
 
 def existing_file(path: StrPath) -> Path:
-    """Return the path of a file that exists.
+    """Return the path of an existing file.
 
-    **Raises:** `FileNotFoundError`, or `IsADirectoryError` when it is a folder.
+    **Raises:** `FileNotFoundError`, or `IsADirectoryError` if the path is a folder.
     """
     path = Path(path)
     if "\0" in str(path) or not path.exists():
@@ -41,14 +41,14 @@ def existing_file(path: StrPath) -> Path:
 
 
 def check_suffix(path: StrPath, *suffixes: str) -> None:
-    """Raise `ValueError` if the name of an output file has another suffix."""
+    """Raise `ValueError` unless the name of an output file has one of the suffixes."""
     is_known = Path(path).suffix.lower() in suffixes
     expect(is_known, path, f"the name of this file must end in {' or '.join(suffixes)}")
 
 
 @contextmanager
 def naming(where: StrPath) -> Generator[None, None, None]:
-    """Add the file, or the place in it, to errors about its contents."""
+    """Prepend a file, or a place in it, to errors about its contents."""
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
@@ -56,7 +56,7 @@ def naming(where: StrPath) -> Generator[None, None, None]:
 
 
 def check_units(path: StrPath, mm_per_unit: float, up: str = "y") -> None:
-    """Raise `ValueError` for an invalid length of the unit (mm) or an invalid upward axis."""
+    """Raise `ValueError` for an invalid unit of length (mm) or upward axis."""
     expect(
         0 < mm_per_unit < np.inf,
         path,
@@ -66,20 +66,20 @@ def check_units(path: StrPath, mm_per_unit: float, up: str = "y") -> None:
 
 
 def with_y_up(vectors: Float[np.ndarray, "n 3"], up: str) -> Float[np.ndarray, "n 3"]:
-    """Rotate vectors of a file by 90 degrees around x, so that its upward axis becomes +y."""
+    """Rotate vectors of a file so that its upward axis becomes +y."""
     return vectors if up == "y" else vectors[:, [0, 2, 1]] * [1, 1, -1]
 
 
 @contextmanager
 def atomic_path(path: StrPath) -> Generator[Path, None, None]:
-    """Yield a temporary path beside `path`, with its suffix; it is renamed to `path` if the block
-    succeeds.
+    """Yield a temporary path beside `path` with the same suffix, and rename it to `path` if the
+    block succeeds.
 
     If the block raises, the temporary file is removed and an existing file at `path` is unchanged.
-    Only a killed process leaves the temporary file.
+    Only a killed process leaves the temporary file behind.
 
-    **Raises:** `FileNotFoundError` when the folder does not exist, another `OSError` that names
-    `path` when it cannot be written, such as `IsADirectoryError`.
+    **Raises:** `FileNotFoundError` if the folder does not exist; another `OSError` that names
+    `path`, such as `IsADirectoryError`, if it cannot be written.
     """
     path = Path(path)
     folder = path.parent
@@ -109,9 +109,9 @@ def atomic_path(path: StrPath) -> Generator[Path, None, None]:
 
 
 def fingerprint(path: StrPath) -> str:
-    """Return the size and the SHA-256 of a file.
+    """Return the size and the SHA-256 digest of a file.
 
-    **Raises:** `OSError` when the file cannot be read.
+    **Raises:** `OSError` if the file cannot be read.
     """
     with open(path, "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -119,9 +119,9 @@ def fingerprint(path: StrPath) -> str:
 
 
 def write_record(path: StrPath, record: Mapping[str, Any]) -> None:
-    """Write a record as JSON, completely or not at all.
+    """Write a record as JSON, atomically.
 
-    **Raises:** `FileNotFoundError` when the folder does not exist.
+    **Raises:** `FileNotFoundError` if the folder does not exist.
     """
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
@@ -143,21 +143,21 @@ def read_record(path: StrPath) -> dict[str, Any]:
 
 
 def record_names(cls: Any) -> list[str]:
-    """Return the names of the fields with which records of a class are made."""
+    """Return the names of the fields of a class that its constructor takes."""
     return [field.name for field in dataclasses.fields(cls) if field.init]
 
 
 def plain_record(record: Any, **given: Any) -> dict[str, Any]:
-    """Return the table of a record, which `Table.record` reads: the fields that are not `None`,
-    except for the given ones, as plain numbers.
+    """Convert a record to a table for `Table.record`: its fields as plain numbers, without those
+    that are `None`. Given entries replace fields.
     """
     values = {name: getattr(record, name) for name in record_names(record)} | given
     return {name: plain_numbers(value) for name, value in values.items() if value is not None}
 
 
 def save_exports(material: Material, path: StrPath) -> None:
-    r"""Write a material's Gaussians as parameters of other renderers to a JSON file
-    (`splatjax.exports.data_sheet`), completely or not at all.
+    r"""Write the Gaussians of a material as parameters of other renderers
+    (`splatjax.exports.data_sheet`) to a JSON file, atomically.
 
     **Raises:** `ValueError` for a material with separate single scattering, for which other
     renderers have no parameter; `OSError` if the file cannot be written.

@@ -1,4 +1,4 @@
-"""Surfaces of Gaussian-splatting scenes, whose ellipsoids become discs."""
+"""Conversion of the ellipsoids of Gaussian-splatting scenes to discs."""
 
 import warnings
 from collections.abc import Mapping
@@ -14,16 +14,16 @@ from ._files import expect
 
 _PLACES, _COLORS = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
-_TURNS = ("rot_1", "rot_2", "rot_3", "rot_0")  # the real part last
+_TURNS = ("rot_1", "rot_2", "rot_3", "rot_0")  # with the real part last
 GAUSSIAN_COLUMNS = {*_PLACES, *_COLORS, *_SCALES, *_TURNS, "opacity"}
 _HARMONIC = 0.5 / np.pi**0.5  # spherical harmonic of degree 0
-_RADIUS = 2.0  # standard deviations: a disc of this radius has the variance of the Gaussian
+_RADIUS = 2.0  # standard deviations; a disc of this radius has the variance of the Gaussian
 
 
 def spz_columns(path: Path) -> dict[str, np.ndarray]:
-    """Read the ellipsoids of an SPZ file by gsply, as the columns of a PLY file.
+    """Read the ellipsoids of an SPZ file with gsply, as columns like those of a PLY file.
 
-    **Raises:** `ValueError` without gsply, or for a file that it cannot read.
+    **Raises:** `ValueError` without gsply, and for a file that gsply cannot read.
     """
     check_installed(f"{path}: SPZ", "gsply")
     import gsply
@@ -39,9 +39,9 @@ def surface_columns(
 ) -> dict[str, np.ndarray]:
     """Convert the columns of ellipsoids to those of splats, in the unit of the file.
 
-    Ellipsoids below an opacity are left out. The normal is the shortest axis, the radius is the
-    radius of a disc with the variance along the two other axes, and the albedo is the mean color,
-    decoded from sRGB.
+    Ellipsoids below an opacity are omitted. The normal is the shortest axis, the radius is that of
+    a disc with the variance of the two other axes, and the albedo is the mean color, decoded from
+    sRGB.
     """
     from scipy.spatial.transform import Rotation  # takes a third of a second
 

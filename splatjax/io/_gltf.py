@@ -1,4 +1,4 @@
-"""Scenes as binary glTF, by trimesh."""
+"""Writing of scenes as binary glTF, by trimesh."""
 
 import warnings
 from pathlib import Path
@@ -35,21 +35,21 @@ def save_gltf(
 ) -> None:
     r"""Write a scene as a binary glTF file: triangles, material, camera, and punctual lights.
 
-    The material has the extensions for volume, its scattering (a draft of Khronos), diffuse
-    transmission, index of refraction and specular strength. The albedo of the splats becomes the
-    color of the vertices, which viewers without these extensions show.
+    The material uses the extensions for volume, volume scattering (a draft), diffuse transmission,
+    index of refraction and specular strength. The albedo of the splats is stored as vertex colors,
+    which viewers without these extensions show.
 
     **Arguments:**
 
-    - `mesh`: closed triangles that bound the body, mm, which volumes need; `None` draws a hexagon
-      for each splat.
+    - `mesh`: closed triangles that bound the body, mm, which volumes require; `None` draws a
+      hexagon for each splat.
     - `lux`: irradiance of 1 lux in the unit of the lights, as for `load_lights`.
 
-    A warning names what glTF cannot store: lights of other kinds, and a principal point away from
-    the middle of the picture.
+    A warning reports contents that glTF cannot store: lights of other kinds, and a principal point
+    away from the middle of the picture.
 
-    **Raises:** `ValueError` for another suffix than .glb, or a material of neither one nor three
-    channels; `OSError` if the file cannot be written.
+    **Raises:** `ValueError` for a suffix other than .glb, and for a material of neither one nor
+    three channels; `OSError` if the file cannot be written.
     """
     import trimesh  # takes a second
     from trimesh.exchange.gltf import export_glb
@@ -107,7 +107,7 @@ def save_gltf(
         tree["cameras"] = [{"type": "perspective", "perspective": lens}]
         tree["materials"] = [material]
         tree["extensionsUsed"] = [*material["extensions"]]
-        if named:  # a list of lights must not be empty
+        if named:  # glTF forbids an empty list of lights
             tree["extensionsUsed"].append(_LIGHTS)
             tree["extensions"] = {_LIGHTS: {"lights": [_light(light, lux) for light in named]}}
 
@@ -166,4 +166,4 @@ def _light(light: AbstractLight, lux: float) -> dict[str, Any]:
 
 
 def _matrix(pose: np.ndarray) -> list[float]:
-    return pose.T.ravel().tolist()  # column by column
+    return pose.T.ravel().tolist()  # in column-major order

@@ -1,5 +1,5 @@
-"""Pictures of every format that OpenImageIO reads, as arrays with row 0 at the top; PNG and WebP
-for displays; frames with all layers as OpenEXR.
+"""Reading of pictures in all formats of OpenImageIO, with row 0 at the top; writing of PNG and WebP
+for displays, and of frames with all layers as OpenEXR.
 """
 
 import errno
@@ -22,7 +22,7 @@ from ._cameras import camera_matrices
 from ._files import StrPath, atomic_path, check_suffix, existing_file, expect, naming
 from ._spectra import SPECTRAL, channel_names, picture_to_rgb
 
-MANIFEST = "splatjax.manifest"  # attribute of the settings of a picture
+MANIFEST = "splatjax.manifest"  # header attribute with the settings of a picture
 _BYTES_PER_VALUE = 24.0  # while decoding in double precision
 
 
@@ -32,12 +32,12 @@ def read_planes(
     """Read the channels of a picture by name. Integers are divided by the maximum of their type.
     Values are not decoded, and colors are not multiplied by alpha.
 
-    **Returns:** channels, attributes of the file, and whether its values are floats.
+    **Returns:** the channels, the attributes of the file, and whether its values are floats.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, is cut short or
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read, is truncated or
     does not fit into memory.
     """
-    import OpenImageIO as oiio  # 17 MB, so only where a picture is read
+    import OpenImageIO as oiio  # 17 MB, so imported only here
 
     path = existing_file(path)
     settings, pixels, spec = oiio.ImageSpec(), None, oiio.ImageSpec()
@@ -51,7 +51,7 @@ def read_planes(
         pixels = file.read_image("float")
     try:
         fault = oiio.geterror() if file is None else file.geterror()
-    except UnicodeDecodeError:  # the message repeats bytes of the file
+    except UnicodeDecodeError:  # the message contains bytes of the file
         fault = "its header is damaged"
     if pixels is None or fault:
         fault = " ".join(fault.replace(f'"{path}"', "").split())
@@ -69,8 +69,8 @@ def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
 
     **Returns:** R, G and B, or Y alone, as in the file.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, has neither R, G
-    and B nor Y, or has integers, which are encoded for a display.
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read, has neither R, G
+    and B nor Y, or contains integers, which are encoded for a display.
     """
     values, is_linear = _colors(path)
     expect(is_linear, path, "is encoded for a display; give linear light, such as OpenEXR")
@@ -78,13 +78,13 @@ def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
 
 
 def read_map(path: StrPath) -> Float[np.ndarray, "height width 3"]:
-    """Read a map of data other than color: three channels, not decoded."""
+    """Read a map of data other than color, with three channels and without decoding."""
     values, _ = _colors(path)
     return np.broadcast_to(values, (*values.shape[:2], 3))
 
 
 def read_color(path: StrPath) -> Float[np.ndarray, "height width 3"]:
-    """Read an albedo in linear light: integers are sRGB, floating-point numbers are linear.
+    """Read an albedo in linear light. Integers are sRGB; floating-point numbers are linear.
 
     **Raises:** as `read_picture` does, and `ValueError` for values outside [0, 1].
     """
@@ -101,7 +101,7 @@ def _colors(path: StrPath) -> tuple[Float[np.ndarray, "height width _"], bool]:
     planes, _, is_linear = read_planes(path)
     names = "RGB" if "R" in planes else "Y"
     expect(planes.keys() >= {*names}, path, f"has neither R, G and B nor Y: {', '.join(planes)}")
-    with np.errstate(invalid="ignore"):  # of NaN that signals
+    with np.errstate(invalid="ignore"):  # from signaling NaN
         return np.stack([planes[name] for name in names], axis=-1).astype(np.float64), is_linear
 
 
@@ -113,20 +113,19 @@ def write_png(
     wavelengths: Numbers | None = None,
     illuminant: str | None = "D65",
 ) -> None:
-    r"""Write a picture for an sRGB display, 8 bits, completely or not at all.
+    r"""Write a picture for an sRGB display with 8 bits, atomically.
 
     **Arguments:**
 
-    - `picture`: a frame, whose beauty over black is written; or linear values of 1 (gray), 3 (RGB)
-      or 4 channels (RGB premultiplied by alpha, and alpha; written without premultiplication, as
-      PNG requires).
-    - `exposure`: exposure in stops: the values are multiplied by `2^exposure` before they are
-      encoded. Values above 1 are clipped.
-    - `wavelengths`: of the channels, nm, such as `material.wavelengths`; their spectra are
-      converted to color under an `illuminant`, as `picture_to_rgb` does.
+    - `picture`: a frame, whose beauty is written over black, or linear values of 1 (gray), 3 (RGB)
+      or 4 channels (premultiplied RGB and alpha, written unpremultiplied as PNG requires).
+    - `exposure`: exposure in stops: values are multiplied by `2^exposure`, clipped at 1 and
+      encoded.
+    - `wavelengths`: wavelengths of the channels, nm, such as `material.wavelengths`; the spectra
+      are converted to color under an `illuminant`, as `picture_to_rgb` does.
 
-    **Raises:** `ValueError` for another suffix, number of channels, or an exposure that is not
-    finite; `FileNotFoundError` when the folder does not exist.
+    **Raises:** `ValueError` for another suffix or number of channels, and for an exposure that is
+    not finite; `FileNotFoundError` if the folder does not exist.
     """
     check_suffix(path, ".png")
     values = picture.beauty if isinstance(picture, Frame) else picture
@@ -142,15 +141,15 @@ def write_png(
 def write_animation(
     path: StrPath, frames: Sequence[StrPath], *, frames_per_second: float = 24.0
 ) -> None:
-    r"""Join pictures into a lossless, endless WebP animation, completely or not at all.
+    r"""Write pictures as a lossless, endlessly repeating WebP animation, atomically.
 
     **Arguments:**
 
-    - `frames`: PNG files in order, at least one, all of one size.
-    - `frames_per_second`: from 0.1 to 60; browsers slow down faster ones.
+    - `frames`: PNG files in order, at least one, all of equal size.
+    - `frames_per_second`: from 0.1 to 60; browsers slow down faster animations.
 
-    **Raises:** `ValueError` for no frames, several sizes, and a speed out of range; `OSError` when
-    a frame cannot be read, or the folder does not exist.
+    **Raises:** `ValueError` without frames, for unequal sizes, and for a speed out of range;
+    `OSError` if a frame cannot be read or the folder does not exist.
     """
     expect(
         frames and 0.1 <= frames_per_second <= 60,
@@ -158,7 +157,7 @@ def write_animation(
         f"{len(frames)} frames at {frames_per_second:g} per second; give at least one frame, and "
         "0.1 to 60 per second",
     )
-    # Frames begin at rounded milliseconds, so that rounding errors do not add up.
+    # Round the start times of frames to milliseconds, so that rounding errors do not add up.
     begins = [round(1000 * i / frames_per_second) for i in range(len(frames) + 1)]
     options = {"save_all": True, "duration": np.diff(begins).tolist(), "loop": 0, "lossless": True}
     with atomic_path(path) as temporary:
@@ -166,7 +165,7 @@ def write_animation(
 
 
 class _Film(Image.Image):
-    """Files as one picture of many frames, with only one frame in memory at a time."""
+    """A picture of many frames that are files, with only one frame in memory at a time."""
 
     def __init__(self, frames: Sequence[StrPath]):
         super().__init__()
@@ -200,24 +199,23 @@ def write_exr(
     half: bool = False,
     wavelengths: Numbers | None = None,
 ) -> None:
-    r"""Write a frame and all its layers to an OpenEXR file, single precision, completely or not at
-    all.
+    r"""Write a frame and all its layers to an OpenEXR file in single precision, atomically.
 
-    | channels | what they are |
+    | channels | contents |
     | --- | --- |
     | `R G B A` | beauty, premultiplied, and coverage |
     | `Z` | depth, mm; inf where no surface is visible |
     | `position.X Y Z`, `normal.X Y Z` | of the front surface, in world space; positions in mm |
     | `albedo.R G B`, `irradiance.R G B`, `diffuse.R G B`, `specular.R G B` | premultiplied |
-    | `single_scattering.R G B` | premultiplied; only when the material has such a term |
+    | `single_scattering.R G B` | premultiplied; only if the material has this term |
     | `shadow1.Y`, `shadow2.Y`, ... | per light |
     | `diffusion1.R G B`, ... | per Gaussian: `diffuse = sum_k weights_k diffusion_k` |
 
-    Pictures of another number of channels than 3 have `beauty.1`, `beauty.2`, ..., `albedo.1`, ...
-    instead of R G B; with `wavelengths`, `S0.550,000nm`, ..., `albedo.S0.550,000nm`, ..., as in the
-    layout for spectral images of Fichet, Pacanowski and Wilkie 2021. The header contains the
-    weights of the Gaussians (`splatjax.weights.1`, ...: a value per channel) and the color space
-    (linear, Rec. 709 primaries, D65).
+    If there are not 3 channels, R G B become `beauty.1`, `beauty.2`, ..., `albedo.1`, ...; with
+    `wavelengths`, they become `S0.550,000nm`, ..., `albedo.S0.550,000nm`, ..., the layout of
+    Fichet, Pacanowski and Wilkie 2021 for spectral images. The header contains the weights of the
+    Gaussians (`splatjax.weights.1`, ..., one value per channel) and the color space (linear, Rec.
+    709 primaries, D65).
 
     **Arguments:**
 
@@ -227,13 +225,13 @@ def write_exr(
       and `worldToNDC` (column and row divided by the size of the picture), as in RenderMan. Both
       multiply row vectors: `[x y z 1] M`, divided by the last entry.
     - `half`: write half precision, except for depth and position.
-    - `wavelengths`: of the channels, nm.
+    - `wavelengths`: wavelengths of the channels, nm.
 
-    **Raises:** `ValueError` for another suffix than `.exr`, `FileNotFoundError` when the folder
-    does not exist.
+    **Raises:** `ValueError` for a suffix other than `.exr`; `FileNotFoundError` if the folder does
+    not exist.
     """
     check_suffix(path, ".exr")
-    from splatjax import __version__  # defined only after the whole package is imported
+    from splatjax import __version__  # defined after the package is imported
 
     weights = np.asarray(frame.weights, np.float32)
     gaussians, channels = weights.shape
@@ -270,16 +268,16 @@ def write_exr(
     with atomic_path(path) as temporary, OpenEXR.File(header, planes) as file:
         try:
             file.write(str(temporary))
-        except Exception as error:  # the package raises whatever its C++ side throws
+        except Exception as error:  # OpenEXR raises exceptions of any kind
             reason = " ".join(str(error).replace(str(temporary), "").split())
             raise OSError(errno.EIO, reason, str(temporary)) from None
 
 
 def read_exr(path: StrPath) -> Frame:
-    r"""Read a frame that `write_exr` wrote; single precision is restored exactly.
+    r"""Read a frame that `write_exr` wrote. Single precision is restored exactly.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or lacks the
-    layers of a frame.
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read or lacks layers of a
+    frame.
     """
     planes, header, _ = read_planes(path)
     names = sorted(name for name in planes if name.startswith(SPECTRAL)) or channel_names(
@@ -308,7 +306,7 @@ def read_exr(path: StrPath) -> Frame:
 
 
 def _layout(names: list[str], lights: int, gaussians: int, has_single: bool) -> dict[str, Any]:
-    """Name the planes of each field of a frame: arrays over the axes of the field other than height
+    """Name the planes of each field of a frame, in arrays over all axes of the field except height
     and width.
     """
 

@@ -1,6 +1,4 @@
-"""Environments and lights from files, and TOML files that list pictures with their cameras and
-lights.
-"""
+"""Environments and lights from files, and TOML files that list pictures with cameras and lights."""
 
 from pathlib import Path
 from typing import Any
@@ -56,7 +54,8 @@ _LIGHTS: dict[str, type[AbstractLight]] = {
     "sphere": SphereLight,
     "environment": EnvironmentLight,
 }
-# Of lights that may face a `target`: the place, and the field that the target replaces.
+# For lights that may face a `target`: the field of the position, and the field that the target
+# replaces.
 _AIMED = {
     SpotLight: ("position", "direction"),
     GaussianBeam: ("origin", "direction"),
@@ -68,14 +67,14 @@ LIGHT_ENTRIES = {"kind", *_FACING}.union(*map(record_names, _LIGHTS.values()))
 
 
 def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
-    r"""Read an environment light: a latitude-longitude map in OpenEXR, Radiance HDR or another
-    floating-point format. Maps of more than 512 rows are halved by averaging as long as both sides
-    are even, with little effect on samples and highlights.
+    r"""Read an environment light from a latitude-longitude map in OpenEXR, Radiance HDR or another
+    floating-point format. Maps of more than 512 rows are repeatedly halved by averaging while both
+    sides are even, with little effect on samples and highlights.
 
     **Arguments:** `fields`: the other fields of `EnvironmentLight`, by name.
 
     **Raises:** as `read_picture` does, and `ValueError` for a map that is not twice as wide as
-    high, or has radiance that is negative or not finite.
+    high, or has negative or non-finite radiance.
     """
     image = read_picture(path)
     while len(image) > _MOST_ROWS and not np.any(np.mod(image.shape[:2], 2)):
@@ -85,8 +84,8 @@ def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
 
 
 def write_image(path: StrPath, image: Any) -> None:
-    """Write the image of an environment to an EXR file, completely or not at all."""
-    import OpenImageIO as oiio  # 17 MB, so only where a picture is written
+    """Write the image of an environment to an EXR file, atomically."""
+    import OpenImageIO as oiio  # 17 MB, so imported only here
 
     with atomic_path(path) as temporary:
         oiio.ImageBuf(np.asarray(image, np.float32)).write(str(temporary))
@@ -97,16 +96,16 @@ def load_lights(
 ) -> list[AbstractLight]:
     r"""Read the punctual lights of a glTF or GLB file (KHR_lights_punctual).
 
-    A surface that faces a directional light of 1 lux receives the irradiance `lux`. A surface that
-    is 1 unit of length from a point or spot light of 1 candela receives the same. With `lux` 1,
-    pictures are in candela per square meter.
+    A surface that faces a directional light of 1 lux receives the irradiance `lux`, and so does a
+    surface at 1 unit of length from a point or spot light of 1 candela. With `lux=1`, pictures are
+    in candela per square meter.
 
     **Arguments:**
 
     - `mm_per_unit`: length of the file's unit, mm; glTF prescribes meters (1000).
     - `up`: the file's upward axis, `"y"` or `"z"`; lights have +y up.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read.
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read.
     """
     path, lights = existing_file(path), []
     check_units(path, mm_per_unit, up)
@@ -130,14 +129,14 @@ def read_observations(path: StrPath) -> list[Observation]:
     r"""Read a list of pictures with their cameras and lights.
 
         [[pictures]]
-        file = "left.exr"           # linear light: R, G and B, or Y; beside this file
+        file = "left.exr"           # linear light, R, G and B or Y; path relative to this file
         mask = "left_mask.exr"      # optional: pixels that are 0 do not count
         noise = 0.01                # optional: standard deviation / root mean square
-        intensity = "known"         # or "unknown": one factor on its light is found;
-                                    # or "unknown color": one for each channel
+        intensity = "known"         # or "unknown": fit one factor of the light;
+                                    # or "unknown color": fit one factor per channel
         camera = { position = [0, 0, 500], target = [0, 0, 0], fov = 25 }  # mm, degrees (vertical)
         [[pictures.lights]]
-        kind = "directional"        # direction (the way it travels), irradiance; cast_shadows
+        kind = "directional"        # direction (in which light travels), irradiance; cast_shadows
         direction = [1, -0.3, -0.5]
         irradiance = [3.14, 3.14, 3.14]
 
@@ -146,14 +145,14 @@ def read_observations(path: StrPath) -> list[Observation]:
     degrees), "beam" (`origin`, `direction`, `power`, `variance` in mm^2), "rectangle" (`center`,
     `radiance`, `edges`), "disk" (`center`, `radiance`, `direction`, `radius`), "sphere" (`center`,
     `radiance`, `radius`; all three `cast_shadows`) and "environment" (`image`: studio, overcast,
-    sun, or a file; `rotation`, `strength`, `up`). In place of the `direction` of a spot, beam or
-    disk there may be a `target`, the point that it faces; in place of the `edges` of a rectangle a
-    `target`, `width` and `height`. Color is one number per channel, or one for all.
+    sun, or a file; `rotation`, `strength`, `up`). Instead of `direction`, a spot, beam or disk may
+    have a `target`, the point that it faces; instead of `edges`, a rectangle may have `target`,
+    `width` and `height`. A color is one number per channel, or one for all.
 
     **Returns:** an `Observation` for each picture, in JAX's default precision.
 
-    **Raises:** `ValueError` for any other content, with the fault and the remedy;
-    `FileNotFoundError` for a missing picture.
+    **Raises:** `ValueError` for invalid content, with the fault and the remedy; `FileNotFoundError`
+    for a missing picture.
     """
     path = Path(path)
     file = Table(path, "", read_toml(path, "name one that lists pictures"), ["pictures"])
@@ -162,7 +161,9 @@ def read_observations(path: StrPath) -> list[Observation]:
 
 
 def picture_paths(path: StrPath) -> list[Path]:
-    """Return the path of a file of observations, followed by the files that it lists."""
+    """Return the path of a file of observations, followed by the paths of the files that it
+    lists.
+    """
     path = Path(path)
     pictures = read_toml(path, "name one that lists pictures")["pictures"]
     return [path] + [
@@ -198,7 +199,7 @@ def _observation(table: Table) -> Observation:
 
 
 def look_at(table: Table, width: int, height: int) -> Camera:
-    """Make a camera from a table of position, target, up and field of view."""
+    """Make a camera from a table with position, target, up and field of view."""
     vectors = [table.numbers(n, d).tolist() for n, d in zip(PLACE, _UPRIGHT, strict=False)]
     for name, vector in zip(PLACE, vectors, strict=False):
         table.expect(np.shape(vector) == (3,), f"{name} must be three numbers; it is {vector}")
@@ -209,9 +210,9 @@ def look_at(table: Table, width: int, height: int) -> Camera:
 
 
 def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
-    """Return the table of a light; `image` is the file name of an environment's image.
+    """Convert a light to a table. `image` is the file name of an environment's image.
 
-    **Raises:** `ValueError` for a light of a kind that a file cannot store.
+    **Raises:** `ValueError` for a kind of light that a file cannot store.
     """
     kinds = {record: kind for kind, record in _LIGHTS.items()}
     if type(light) not in kinds:
@@ -229,7 +230,9 @@ def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
 
 
 def light_of(table: Table, channels: int, in_gray: bool = False) -> AbstractLight:
-    """Make a light from a table, with the channels of a picture, and its image in gray or not."""
+    """Make a light with the channels of a picture from a table. `in_gray` converts its image to
+    gray.
+    """
     light = _LIGHTS[table.one_of("kind", _LIGHTS)]
     names, given = {"kind", *record_names(light)}, dict[str, Any]()
     if "target" in table.entries and light in _AIMED:

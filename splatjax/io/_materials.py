@@ -1,4 +1,4 @@
-"""Materials as TOML files: optical coefficients, their source, and the Gaussians fitted to them."""
+"""Materials in TOML files: optical coefficients, their source, and the Gaussians fitted to them."""
 
 import warnings
 from collections.abc import Mapping
@@ -48,7 +48,7 @@ VARIANCE_UNIT = "mm^2"
 MATERIAL_TABLES = ("wavelengths", *KINDS, "surface", "single_scattering", "angles", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
 _Stored: TypeAlias = Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin | Burley
-# Names in [fit] of profiles whose coefficients are in the file.
+# Descriptions in [fit] of the profiles whose coefficients a file can store.
 _MODELS: dict[type, str] = {
     Dipole: "classical dipole",
     BetterDipole: "better dipole",
@@ -65,7 +65,7 @@ def list_materials() -> tuple[str, ...]:
 
 
 def material_path(name_or_path: StrPath) -> Path:
-    """Return the path of a material, given like in `load_material` by its name or its path.
+    """Return the path of a material given by name or path, as in `load_material`.
 
     **Raises:** `ValueError` for an unknown name.
     """
@@ -82,7 +82,7 @@ def material_path(name_or_path: StrPath) -> Path:
 
 
 def load_material(name_or_path: StrPath | Table) -> Material:
-    r"""Load a material: its fitted Gaussians and its surface.
+    r"""Load the fitted Gaussians and the surface of a material.
 
     **Arguments:** `name_or_path`: one of `list_materials()`, the path of a TOML file, or its
     contents as a `Table`.
@@ -91,8 +91,8 @@ def load_material(name_or_path: StrPath | Table) -> Material:
 
     A warning reports coefficients that were changed after their fit.
 
-    **Raises:** `ValueError` for an unknown name, and for a file that is not a material, with the
-    fault and the remedy.
+    **Raises:** `ValueError` for an unknown name, and, with the fault and the remedy, for a file
+    that is not a material.
     """
     tables, surface, profile = _read(name_or_path)
     path, fitted = tables.path, tables.path.with_name(f"{tables.path.stem}_fitted.toml")
@@ -102,12 +102,12 @@ def load_material(name_or_path: StrPath | Table) -> Material:
     fit.one_of("unit", [VARIANCE_UNIT])
     digest = digest_of(tables.entries)
     if fit.entries.get("coefficients_digest", digest) != digest:
-        if tables.name:  # it is a table of a scene
+        if tables.name:  # a table of a scene file
             remedy = "copy it to a file, `splatjax fit` that, and name the result as `material`"
         warnings.warn(
-            f"{tables.where.rstrip(':')} has coefficients that were changed after the fit, and its "
-            f"Gaussians, which make the picture, are still of the earlier ones; {remedy}",
-            stacklevel=1,  # a command that loads a file several times warns once
+            f"{tables.where.rstrip(':')} has coefficients that were changed after the fit, and the "
+            f"Gaussians that are rendered still belong to the earlier ones; {remedy}",
+            stacklevel=1,  # so that a command that loads a file several times warns once
         )
     gaussians = fit.record(SumOfGaussians)
     fit.make(
@@ -129,8 +129,7 @@ def load_material(name_or_path: StrPath | Table) -> Material:
 
 
 def surface_and_source(name_or_path: StrPath) -> tuple[dict[str, Any], dict[str, Any]]:
-    r"""Return the surface and the wavelengths of a material's file, as arguments of `Material`, and
-    its [source].
+    r"""Return the arguments of `Material` for surface and wavelengths in a file, and its [source].
 
     **Raises:** `ValueError` as `load_material` does.
     """
@@ -145,8 +144,7 @@ def load_medium(name_or_path: StrPath) -> Medium:
 
     **Returns:** a `Medium` in JAX's default precision; coefficients in 1/mm.
 
-    **Raises:** `ValueError` as `load_material` does, and for a material that was published without
-    coefficients.
+    **Raises:** `ValueError` as `load_material` does, and for a material without coefficients.
     """
     tables, _, profile = _read(name_or_path)
     if isinstance(profile, Dipole):
@@ -160,7 +158,7 @@ def load_medium(name_or_path: StrPath) -> Medium:
 
 
 def load_mean_cosine(material: StrPath | Table) -> float:
-    r"""Load `g`, the mean cosine of a material's phase function, 0 if it has none.
+    r"""Load `g`, the mean cosine of a material's phase function, which is 0 if not given.
 
     **Raises:** `ValueError` as `load_material` does.
     """
@@ -171,8 +169,7 @@ def load_mean_cosine(material: StrPath | Table) -> float:
 
 
 def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin | Burley:
-    r"""Load the coefficients of a material as a profile to which Gaussians can be fitted, or its
-    pigments.
+    r"""Load the coefficients or the pigments of a material, to fit Gaussians to their profile.
 
     **Arguments:** `name_or_path`: one of `list_materials()`, or the path of a TOML file.
 
@@ -185,7 +182,7 @@ def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin | Bu
 
 
 def load_skin(material: StrPath | Table) -> Skin | None:
-    """Load the pigments of a material, or of the tables of one; `None` if it has no [skin].
+    """Load the pigments of a material from its file or tables; `None` without [skin].
 
     **Raises:** `ValueError` as `load_medium` does.
     """
@@ -202,22 +199,22 @@ def save_material(
     fit: Mapping[str, Any] | None = None,
     g: float = 0.0,
 ) -> None:
-    r"""Write a material to a TOML file, completely or not at all.
+    r"""Write a material to a TOML file, atomically.
 
         save_material(material, "stone.toml", source={"provenance": "made up"})
         material = load_material("stone.toml")
 
     **Arguments:**
 
-    - `material`: one material (no batch); written with enough digits to be restored exactly.
+    - `material`: one material (no batch), written with enough digits to be restored exactly.
     - `path`: path of the file; its folder must exist.
-    - `profile`: the profile to which the Gaussians were fitted. Its coefficients are written in
-      place of the material's `medium`, and its kind into [fit].
+    - `profile`: the profile to which the Gaussians were fitted. Its coefficients are written
+      instead of the material's `medium`, and its kind is written to [fit].
     - `source`: source of the numbers: `citation`, `provenance`, ...
     - `fit`: further entries of [fit]: `error`, `energy_error`, ...
-    - `g`: mean cosine of the phase function, kept in [medium].
+    - `g`: mean cosine of the phase function, written to [medium].
 
-    **Raises:** `OSError` if the file cannot be written, `ValueError` for another kind of profile.
+    **Raises:** `OSError` if the file cannot be written; `ValueError` for another kind of profile.
     """
     write_toml(path, plain_material(material, profile, source, fit, g))
 
@@ -229,7 +226,7 @@ def plain_material(
     fit: Mapping[str, Any] | None = None,
     g: float = 0.0,
 ) -> dict[str, Any]:
-    """Return the tables of a material's file; arguments are those of `save_material`."""
+    """Return the tables of a material file. The arguments are those of `save_material`."""
     if not isinstance(profile, _Stored | None):
         raise ValueError(
             "profile must be a Dipole, BetterDipole, PhotonBeam, LayeredMultipole, Skin or Burley, "
@@ -286,7 +283,9 @@ def _tables(name_or_path: StrPath) -> Table:
 def _read(
     material: StrPath | Table,
 ) -> tuple[Table, dict[str, Array], Dipole | LayeredMultipole | Skin | Burley | None]:
-    """Read the tables of a material, its surface and wavelengths, and its coefficients, if any."""
+    """Read the tables of a material, its surface and wavelengths, and its coefficients if it has
+    any.
+    """
     tables = material if isinstance(material, Table) else _tables(material)
     path, entries, profile = tables.path, tables.entries, None
     kinds = [KINDS[kind] for kind in KINDS if kind in entries]
@@ -300,7 +299,7 @@ def _read(
         table.entries.update(of_openpbr | table.entries)
         del entries["openpbr"]
     surface = {name: table.numbers(name) for name in table.entries}
-    table.make(Material, SumOfGaussians([1.0], [[1.0]]), **surface)  # checks them
+    table.make(Material, SumOfGaussians([1.0], [[1.0]]), **surface)  # check the values
     roughness = surface.get("roughness")
     table.make(check_values, "roughness", roughness, "in (0, 1]", lambda x: (x > 0) & (x <= 1))
     if "medium" in entries:

@@ -1,4 +1,4 @@
-"""Materials as MaterialX documents, in the terms of OpenPBR."""
+"""Writing of materials as MaterialX documents with OpenPBR surfaces."""
 
 from pathlib import Path
 from string import Template
@@ -26,20 +26,21 @@ _DOCUMENT = Template("""<?xml version='1.0' encoding='utf-8'?>
 def save_materialx(
     path: StrPath, material: Material, *, mm_per_unit: float = 1.0, g: float = 0.0
 ) -> None:
-    r"""Write a material as a MaterialX document with an OpenPBR surface, completely or not at all.
+    r"""Write a material as a MaterialX document with an OpenPBR surface, atomically.
 
-    The color and the mean free path of the subsurface follow from the material's coefficients, or
-    from its Gaussians (`splatjax.exports.openpbr_subsurface`). `specular_roughness` is the root of
-    the material's roughness. The Gaussians are not stored.
+    The color and the mean free path of the subsurface are computed from the material's
+    coefficients, or from its Gaussians (`splatjax.exports.openpbr_subsurface`).
+    `specular_roughness` is the square root of the material's roughness. The Gaussians are not
+    stored.
 
     **Arguments:**
 
     - `material`: a material of one or three channels.
     - `mm_per_unit`: length of the unit of the other renderer's scene, mm.
-    - `g`: mean cosine of the phase function of the coefficients (`load_mean_cosine`).
+    - `g`: mean cosine of the material's phase function (`load_mean_cosine`).
 
-    **Raises:** `ValueError` for a material of another number of channels; `OSError` if the file
-    cannot be written.
+    **Raises:** `ValueError` for another number of channels; `OSError` if the file cannot be
+    written.
     """
     check_units(path, mm_per_unit)
     inputs = openpbr_inputs(path, material, mm_per_unit, g)
@@ -63,7 +64,7 @@ def check_colors(path: StrPath, material: Material) -> None:
 def openpbr_inputs(
     path: StrPath, material: Material, mm_per_unit: float, g: float
 ) -> dict[str, list[float]]:
-    """Return the inputs of an OpenPBR surface in a file, one or three numbers each.
+    """Return the inputs of an OpenPBR surface, as one or three numbers each.
 
     **Raises:** `ValueError` for a material of another number of channels.
     """

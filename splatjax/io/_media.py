@@ -1,5 +1,5 @@
-"""The tables [medium], [openpbr], [burley] and [[layers]] of materials: optical coefficients, or a
-color and a length.
+"""The tables [medium], [openpbr], [burley] and [[layers]] of materials, which contain optical
+coefficients, or a color and a length.
 """
 
 import hashlib
@@ -46,10 +46,10 @@ _OPENPBR: dict[str, Any] = {
     "specular_ior": 1.5,
     "subsurface_scatter_anisotropy": 0.0,
 }
-# Its entries for the surface, and the power that is the entry of [surface].
+# OpenPBR's entries for the surface, and the exponents that convert them to entries of [surface].
 _OF_SURFACE = (("specular_weight", "specular", 1), ("specular_roughness", "roughness", 2))
 OPENPBR_ENTRIES = ("unit", *_OPENPBR, "subsurface_weight", *(name for name, *_ in _OF_SURFACE))
-# Lengths of normalized diffusion, over its `d`: of Unity's HDRP; Unreal; Christensen and Burley
+# Lengths of normalized diffusion, divided by `d`: Unity's HDRP; Unreal; Christensen and Burley
 # 2015; Blender (`exports.blender_radius`).
 _BURLEY: dict[str, Callable[[Array], Array]] = {
     "scattering_distance": jnp.ones_like,
@@ -63,8 +63,8 @@ LAYER_ENTRIES = (*MEDIUM_ENTRIES, "optical_depth", "thickness", "thickness_unit"
 
 
 def medium_of(table: Table) -> Medium:
-    """Make a medium from a table of reduced scattering, of scattering and its mean cosine, or of a
-    color and a mean free path.
+    """Make a medium from a table with reduced scattering, with scattering and mean cosine, or with
+    a color and a mean free path.
     """
     names = (table.entries.keys() & set().union(*_WAYS)) - {"g"}
     table.expect(
@@ -87,8 +87,8 @@ def medium_of(table: Table) -> Medium:
 
 
 def plain_openpbr(table: Table) -> tuple[dict[str, Any], dict[str, float]]:
-    """Translate the table of an OpenPBR material to a [medium] and the given part of a
-    [surface].
+    """Convert the table of an OpenPBR material to a [medium] and the entries of [surface] that it
+    specifies.
     """
     table.expect(
         table.number("subsurface_weight", 1.0) == 1,
@@ -107,7 +107,7 @@ def plain_openpbr(table: Table) -> tuple[dict[str, Any], dict[str, float]]:
 
 
 def burley_of(table: Table) -> Burley:
-    """Make normalized diffusion from a table of its albedo and one of its lengths."""
+    """Make normalized diffusion from a table with an albedo and a length."""
     names = [name for name in _BURLEY if name in table.entries]
     fault = f"has {' and '.join(names) or 'no length'}; give one of {', '.join(_BURLEY)}"
     table.expect(len(names) == 1, fault)
@@ -124,12 +124,12 @@ def plain_burley(profile: Burley) -> dict[str, Any]:
 
 
 def layer_of(table: Table) -> Layer | Film:
-    """Make the layer or film of a table."""
+    """Make a layer or film from a table."""
     if "optical_depth" in table.entries:
         return table.record(Film)
     table.expect(
         not {"g", "sigma_s_prime"} <= table.entries.keys(),
-        "has g and sigma_s_prime, and layers have reduced scattering alone; leave g out, or give "
+        "has g and sigma_s_prime, but layers only have reduced scattering; leave g out, or give "
         "sigma_s and g",
     )
     table.one_of("thickness_unit", [THICKNESS_UNIT])
@@ -150,19 +150,22 @@ def plain_layer(layer: Layer | Film) -> dict[str, Any]:
 
 
 def digest_of(tables: Mapping[str, Any]) -> str | None:
-    """Compute a digest of the coefficients among the tables of a material; `None` without any."""
+    """Compute a digest of the coefficients in the tables of a material; `None` if there are
+    none.
+    """
     optics = {kind: tables[kind] for kind in KINDS if kind in tables}
     plain = json.dumps(optics, sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:16] if optics else None
 
 
 def dipole_starts() -> DipoleStarts:
-    r"""Read the starts of fits of 1 to 8 Gaussians to dipoles; one descent then replaces a search.
+    r"""Read the starts of fits of 1 to 8 Gaussians to dipoles, with which one descent replaces a
+    search.
 
         fit_gaussians(Dipole(medium), 6, spread=VariancesPerChannel(), start=dipole_starts()(medium,
         6))
 
-    **Returns:** a `DipoleStarts` in JAX's default precision. `tools/make_profiles.py` made it.
+    **Returns:** a `DipoleStarts` in JAX's default precision, made by `tools/make_profiles.py`.
     """
     with np.load(profiles_folder() / "dipole_starts.npz") as file:
         tables = {name: jnp.asarray(table, float) for name, table in file.items()}

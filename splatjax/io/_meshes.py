@@ -1,5 +1,5 @@
-"""Meshes from files, with their maps, and splats sampled from them. trimesh reads the triangles;
-they are checked once for all formats.
+"""Meshes and maps from files, and splats sampled from them. trimesh reads the triangles; one check
+serves all formats.
 """
 
 import os
@@ -29,21 +29,19 @@ from ._files import StrPath, check_units, existing_file, expect, naming, with_y_
 from ._images import read_color, read_map
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
-_LUMA = np.asarray([0.299, 0.587, 0.114])  # of encoded color, Rec. 601
-_BYTES_PER_SPLAT = 2500.0  # while splats are sampled; measured: 1.2 GB for 683,549
+_LUMA = np.asarray([0.299, 0.587, 0.114])  # weights of encoded colors, Rec. 601
+_BYTES_PER_SPLAT = 2500.0  # while sampling; measured: 1.2 GB for 683,549 splats
 _BYTES_PER_CORNER = 300.0  # per corner of a mesh, from reading the file to sampling splats
-# Largest coordinate (areas overflow beyond), units; most repeats of a texture.
+# Largest coordinate in units of the file, beyond which areas overflow; most repeats of a texture.
 _FARTHEST, _MOST_TILES = 1e12, 1e6
 _BORDER = 1e-3  # tolerance of texture coordinates beyond the border of a texture
-_ENDS = re.compile(rb'"wrap[ST]" *: *(33071|33648)')  # a texture of glTF that does not repeat
+_ENDS = re.compile(rb'"wrap[ST]" *: *(33071|33648)')  # a glTF texture that does not repeat
 
 
 class Piece(NamedTuple):
-    """Triangles of one material, in the file's unit.
-
-    Zero normals will be estimated. Missing texture coordinates and colors of vertices are NaN.
-    Colors of vertices, the material's `color` and the `texture`, an encoded picture, are
-    multiplied.
+    """Triangles of one material, in the file's unit. Zero normals are estimated later. Missing
+    texture coordinates and vertex colors are NaN. The albedo is the product of vertex colors, the
+    material's `color` and the `texture`, which is an encoded picture.
     """
 
     mesh: Any  # a `Mesh` with all its arrays
@@ -68,37 +66,36 @@ def sample_mesh(
     seed: int = 0,
     rounded: bool = True,
 ) -> Splats:
-    r"""Sample splats from the mesh in a file (GLB, glTF, OBJ, PLY, STL, OFF), with its maps and the
-    colors of its vertices.
+    r"""Sample splats from a mesh file (GLB, glTF, OBJ, PLY, STL, OFF), with its maps and vertex
+    colors.
 
     **Arguments:**
 
     - `count`: number of splats.
-    - `mm_per_unit`: length of the file's unit, mm. glTF prescribes meters (1000), yet many scans
-      ignore that.
-    - `albedo`: picture, sRGB, or linear for floating-point numbers; `None`: the base color textures
-      of the file, if any.
-    - `specular`: gray picture, not decoded: factor on the material's specular strength.
-    - `normal`: tangent-space normal map, not decoded; green points up.
-    - `parameters`: parameters of the material by name, such as melanin: gray pictures, not decoded,
-      in which whole numbers count from 0 to 1; arrays (height, width); or one number for all.
-    - `weights`: computes `Splats.weights` from the parameters at the splats, each an array, such as
+    - `mm_per_unit`: length of the file's unit, mm. glTF prescribes meters (1000), but many scans
+      ignore this.
+    - `albedo`: a picture, sRGB for integers and linear for floating-point numbers. `None`: the base
+      color textures of the file, if any.
+    - `specular`: a gray picture, not decoded: factor of the material's specular strength.
+    - `normal`: a tangent-space normal map, not decoded; green points up.
+    - `parameters`: parameters of the material by name, such as melanin. Each is a gray picture, not
+      decoded, whose integers are scaled to [0, 1]; an array (height, width); or a number.
+    - `weights`: computes `Splats.weights` from arrays of the parameters at the splats, such as
       `table.factors` of a `splatjax.fitting.weight_table`.
     - `v_up`: whether v = 0 is the *lower* edge of a map. `None` follows the format: true, except in
-      glTF and GLB. If the texture appears upside down, give the opposite.
+      glTF and GLB. If a texture appears upside down, give the opposite.
     - `up`: the file's upward axis, `"y"` or `"z"`; splats have +y up.
-    - `crop_min_y`: the mesh below this height, in the file's unit, is removed.
-    - `crease_angle`: degrees from 0 to 180. An edge is hard if its triangles differ by more than
-      this; used where the file has no normals, or normals that differ by more than this from their
-      triangles.
+    - `crop_min_y`: height, in the file's unit, below which the mesh is removed.
+    - `crease_angle`: degrees from 0 to 180, above which an edge between two triangles is hard. It
+      is used where the file has no normals, or normals that differ from their triangles by more
+      than this angle.
     - `seed`: seed of the random positions.
-    - `rounded`: place splats on a curved surface that follows the mesh's normals, instead of on its
-      flat triangles, which make the edge between light and shadow ragged. Hard edges stay straight.
+    - `rounded`: place splats on a curved surface that follows the normals of the mesh. On flat
+      triangles, the edge between light and shadow is ragged. Hard edges stay straight.
 
     **Returns:** splats in mm; `splatjax.geometry.sample_mesh` describes their distribution.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` that names the file, the fault and the
-    remedy.
+    **Raises:** `FileNotFoundError`, or `ValueError` with the file, the fault and the remedy.
     """
     check_memory(f"{path}: {count} splats", _BYTES_PER_SPLAT * count, "take fewer")
     mesh, textures = read_textured_mesh(
@@ -132,9 +129,9 @@ def read_textured_mesh(
     crop_min_y: float | None = None,
     crease_angle: float = 40.0,
 ) -> tuple[Mesh, Textures]:
-    """Read the mesh in a file, and its maps; arguments and errors as for `sample_mesh`.
+    """Read the mesh in a file and its maps. Arguments and errors are those of `sample_mesh`.
 
-    **Returns:** the mesh, in mm, and its maps.
+    **Returns:** the mesh in mm, and its maps.
     """
     path = existing_file(path)
     check_units(path, mm_per_unit, up)
@@ -185,10 +182,10 @@ def read_textured_mesh(
 
 
 def _read_pieces(path: Path, up: str) -> list[Piece]:
-    """Read the triangles of a file, a piece for each material and place, with +y up.
+    """Read the triangles of a file with +y up, one piece per material and instance.
 
-    **Raises:** `ValueError` when the file cannot be read, has no triangle, values that are not
-    finite or faces of missing vertices; or does not fit into memory.
+    **Raises:** `ValueError` if the file cannot be read, has no triangle, has values that are not
+    finite or faces with missing vertices, or does not fit into memory.
     """
     kind = path.suffix[1:].lower()
     expect(kind in FORMATS, path, f"is not a known mesh format; give {', '.join(FORMATS)}")
@@ -226,7 +223,7 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
 
 
 def _piece(table: dict[str, Any], kind: str, columns: dict[str, Any]) -> Piece:
-    """Convert the mesh arguments that trimesh reads from a file of the given kind."""
+    """Convert the mesh arguments that trimesh reads from a file of a given kind."""
     from trimesh.geometry import triangulate_quads
 
     vertices, faces = np.asarray(table["vertices"], float), triangulate_quads(table["faces"])
@@ -237,7 +234,7 @@ def _piece(table: dict[str, Any], kind: str, columns: dict[str, Any]) -> Piece:
         material = visual.material
         image = getattr(material, "image", getattr(material, "baseColorTexture", None))
         texture = image.fp.getvalue() if hasattr(image, "fp") else None
-        # Exporters write a gray Kd beside a map.
+        # Exporters write a gray Kd together with a map.
         plain = {} if texture else getattr(material, "kwargs", {})
         factor = getattr(material, "baseColorFactor", None)
         color = color * plain.get("kd", 1.0) if factor is None else factor[:3] / 255
@@ -256,8 +253,8 @@ def _piece(table: dict[str, Any], kind: str, columns: dict[str, Any]) -> Piece:
 
 
 def _placed(piece: Piece, matrix: Float[np.ndarray, "4 4"], up: str, repeats: bool) -> Piece:
-    """Transform a piece to its place in the scene, with +y up, and validate it. After a reflection
-    its triangles are reversed, so that they face outward.
+    """Transform a piece to its place in the scene, with +y up, and validate it. A reflection also
+    reverses the triangles, so that they face outward.
     """
     mesh, linear = piece.mesh, matrix[:3, :3]
     turn = slice(None, None, -1 if np.linalg.det(linear) < 0 else 1)
@@ -293,7 +290,7 @@ def _placed(piece: Piece, matrix: Float[np.ndarray, "4 4"], up: str, repeats: bo
 
 
 def _joined(pieces: Sequence[Piece], mm_per_unit: float, flip_v: bool) -> Mesh:
-    """Join pieces into one mesh in mm, with one part per piece; zero normals are unchanged."""
+    """Join pieces into one mesh in mm, with one part per piece. Zero normals are unchanged."""
     starts = np.cumsum([0, *(len(piece.mesh.vertices) for piece in pieces[:-1])])
     faces = [piece.mesh.faces + start for piece, start in zip(pieces, starts, strict=True)]
     vertices, normals, uvs, colors = (
@@ -311,7 +308,7 @@ def _joined(pieces: Sequence[Piece], mm_per_unit: float, flip_v: bool) -> Mesh:
 
 
 def _own_albedo(path: Path, pieces: Sequence[Piece]) -> np.ndarray | tuple[np.ndarray, ...] | None:
-    """Decode the textures of pieces, and multiply them by their plain colors; `None` if no piece
+    """Decode the textures of pieces, and multiply them by the material colors; `None` if no piece
     has a texture.
     """
     pictures = {None: np.ones((1, 1, 3))}

@@ -1,4 +1,4 @@
-"""Splats in PLY files, read at once or, for files that are larger than memory, part by part."""
+"""Splats in PLY files, read at once or, for files larger than memory, in parts."""
 
 import math
 import re
@@ -18,7 +18,7 @@ from ._files import StrPath, atomic_path, check_units, existing_file, expect, na
 from ._gaussian_scenes import GAUSSIAN_COLUMNS, spz_columns, surface_columns
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
-_SHORTEST, _LONGEST = 1e-9, 1e9  # mm; outside this range, single precision loses areas
+_SHORTEST, _LONGEST = 1e-9, 1e9  # mm; outside this range areas overflow or underflow in float32
 _COVER = (
     "sample splats from it first: `splatjax sample {} --mm-per-unit ... --output ...`, in Python "
     "sj.sample_mesh"
@@ -45,39 +45,39 @@ _COLUMNS = {
 _WEIGHT = re.compile(r"weight_([1-9]\d{0,3})_([1-9]\d{0,3})")
 _POWERS = {"centers": 1, "radii": 1, "areas": 2}  # of the unit of length
 _VALID = {
-    "centers": (lambda x: np.abs(x) <= _LONGEST, "within 1e9 mm (what is mm_per_unit?)"),
+    "centers": (lambda x: np.abs(x) <= _LONGEST, "within 1e9 mm (check mm_per_unit)"),
     "normals": (lambda n: n.any(axis=0), "longer than zero"),
-    "radii": (lambda r: (r > _SHORTEST**2) & (r < _LONGEST**2), "positive (what is mm_per_unit?)"),
-    "areas": (lambda a: (a > _SHORTEST**2) & (a < _LONGEST**2), "positive (what is mm_per_unit?)"),
+    "radii": (lambda r: (r > _SHORTEST**2) & (r < _LONGEST**2), "positive (check mm_per_unit)"),
+    "areas": (lambda a: (a > _SHORTEST**2) & (a < _LONGEST**2), "positive (check mm_per_unit)"),
     "albedo": (lambda c: (c >= 0) & (c <= 1), "in [0, 1]; floats are linear, integers sRGB"),
-    "specular": (lambda f: (f >= 0) & (f <= 1e6), "a factor on the material's, from 0 to 1e6"),
-    "roughness": (lambda f: (f >= 0) & (f <= 1e6), "a factor on the material's, from 0 to 1e6"),
-    "weights": (lambda f: (f >= 0) & (f <= 1e6), "factors on the material's, from 0 to 1e6"),
+    "specular": (lambda f: (f >= 0) & (f <= 1e6), "a factor from 0 to 1e6"),
+    "roughness": (lambda f: (f >= 0) & (f <= 1e6), "a factor from 0 to 1e6"),
+    "weights": (lambda f: (f >= 0) & (f <= 1e6), "factors from 0 to 1e6"),
 }
 
 
 def read_splats(
     path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y", opacity: float = 0.5
 ) -> Splats:
-    r"""Read splats from the vertices of a PLY file: ASCII or binary of either byte order,
-    properties in any order.
+    r"""Read splats from the vertices of a PLY file, which may be ASCII or binary with either byte
+    order, with properties in any order.
 
-    | property | what it is |
+    | property | contents |
     | --- | --- |
     | `x y z` | center, in the file's unit |
-    | `nx ny nz` | normal, scaled to unit length; estimated from neighbors when absent |
-    | `radius` (or `radii`) | in the file's unit; from the local density when absent |
-    | `area` (or `areas`) | in the file's unit squared; from the local density when absent |
+    | `nx ny nz` | normal, normalized on reading; estimated from neighbors if absent |
+    | `radius` (or `radii`) | in the file's unit; from the local density if absent |
+    | `area` (or `areas`) | in the file's unit squared; from the local density if absent |
     | `red green blue` | albedo: integers are sRGB up to the type's maximum, floats are linear |
-    | `specular`, `roughness` | factors on the specular strength and roughness of the material |
-    | `weight_1_1`, `weight_1_2`, ... | factors on the material's weights: Gaussian, channel |
+    | `specular`, `roughness` | factors of the specular strength and roughness of the material |
+    | `weight_1_1`, `weight_1_2`, ... | factors of the material's weights: Gaussian, channel |
 
-    Other properties and elements are ignored. A file with faces and without radii is an error,
-    because a mesh should be sampled (`sample_mesh`).
+    Other properties and elements are ignored. A file with faces and without radii raises an error,
+    because a mesh must be sampled (`sample_mesh`).
 
     The ellipsoids of a Gaussian-splatting scene (`f_dc_0`, `scale_0`, `rot_0`, ..., or an SPZ file,
-    which needs gsply) become discs: the shortest axis is the normal, and the two others give the
-    radius. A warning reports that their colors contain the light of the scene.
+    which requires gsply) become discs: the shortest axis is the normal, and the other two determine
+    the radius. A warning reports that the colors contain the light of the scene.
 
     **Arguments:**
 
@@ -116,12 +116,11 @@ def read_splats(
 
 
 def write_splats(path: StrPath, splats: Splats) -> None:
-    r"""Write splats to a binary PLY file, in mm, as float32, completely or not at all.
+    r"""Write splats to a binary PLY file in mm, as float32, atomically.
 
-    Albedo of three channels is written as linear `red green blue` floats (no loss), which
-    `read_splats` restores.
+    An albedo of three channels is written as linear `red green blue` floats.
 
-    **Raises:** `FileNotFoundError` when the folder does not exist, `ValueError` for an albedo that
+    **Raises:** `FileNotFoundError` if the folder does not exist; `ValueError` for an albedo that
     does not have three channels.
     """
     path, names, columns = Path(path), [], []
@@ -155,21 +154,21 @@ def write_splats(path: StrPath, splats: Splats) -> None:
 
 
 class SplatFile:
-    r"""Complete splats in a binary PLY file, read part by part, for `splatjax.render_streamed`.
+    r"""Complete splats in a binary PLY file, read in parts for `splatjax.render_streamed`.
 
-    They keep the order of the file: splats that are near in space should be near in the file
-    (`read_splats` sorts, a stream cannot).
+    The order of the file is kept, so splats that are near in space should be near in the file.
+    (`read_splats` sorts them, a stream cannot.)
 
     **Arguments:**
 
-    - `path`: a PLY file whose vertices have `x y z`, `nx ny nz`, `radius` and `area`, as
-      `read_splats` reads them, are the first element, and have no lists.
-    - `part`: number of splats of a part; about 1 kB of memory each.
+    - `path`: a PLY file whose first element is the vertices, with `x y z`, `nx ny nz`, `radius` and
+      `area` as in `read_splats`, and without lists.
+    - `part`: number of splats per part; each takes about 1 kB of memory.
     - `mm_per_unit`: length of the file's unit, mm.
     - `up`: the file's upward axis, `"y"` or `"z"`.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` if the file is not a binary PLY, is truncated,
-    or lacks one of these properties.
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file is not a binary PLY file, is
+    truncated, or lacks one of these properties.
     """
 
     def __init__(
@@ -184,7 +183,7 @@ class SplatFile:
         check_units(self.path, mm_per_unit, up)
         expect(part >= 1, path, f"part is {part}; give at least one splat")
         with one_sentence(self.path), open(path, "rb") as file:
-            from trimesh.exchange.ply import _parse_header  # only where it is needed
+            from trimesh.exchange.ply import _parse_header  # slow, so imported only here
 
             elements, is_text, _ = _parse_header(file)
             name, vertices = next(iter(elements.items()))
@@ -196,7 +195,7 @@ class SplatFile:
             )
             self.count, self._offset = vertices["length"], file.tell()
             self._names, self._columns = tuple(kinds), np.dtype(list(kinds.items()))
-            self._rows(0, self.count)  # raises where the file is cut short
+            self._rows(0, self.count)  # raises if the file is truncated
         for field in ("normals", "radii", "areas"):
             expect(
                 any(kinds.keys() >= set(names) for names in _COLUMNS[field]),
@@ -207,10 +206,10 @@ class SplatFile:
 
     def __call__(self) -> Iterator[Splats]:
         """Yield all splats from the beginning, in mm and in JAX's default precision, in parts of
-        equal size except for a smaller last one.
+        equal size; the last may be smaller.
 
-        **Raises:** `ValueError` for numbers that are not finite, or that `read_splats` rejects; the
-        total extent is checked at the end.
+        **Raises:** `ValueError` for values that `read_splats` rejects; the total extent is checked
+        at the end.
         """
         corners = []
         for begin in range(0, self.count, self.part):
@@ -223,7 +222,7 @@ class SplatFile:
         _check_places(self.path, np.stack(corners), estimated=False)
 
     def _rows(self, begin: int, count: int) -> np.memmap:
-        """Map only one part of the file, because all pages read from a larger map would count as
+        """Map only one part of the file. All pages that are read from a larger map would count as
         memory.
         """
         offset = self._offset + begin * self._columns.itemsize
@@ -233,9 +232,9 @@ class SplatFile:
 def _splat_fields(
     path: Path, columns: Mapping[str, np.ndarray], mm_per_unit: float, up: str
 ) -> dict[str, Any]:
-    """Convert columns to fields of splats, in mm and with +y up; missing fields are `None`.
+    """Convert columns to fields of splats in mm with +y up. Missing fields are `None`.
 
-    **Raises:** `ValueError` for values that are not finite, or invalid for splats.
+    **Raises:** `ValueError` for values that are invalid for splats.
     """
     expect(
         not columns.keys() >= _GAUSSIAN_SPLATTING,
@@ -271,8 +270,8 @@ def _splat_fields(
         expect(
             as_many and places == [(k + 1, c + 1) for k, c in np.ndindex(shape)],
             path,
-            f"its vertices have {', '.join(name for _, name in factors)}, and not one for each "
-            "Gaussian and channel: write all of them",
+            f"its vertices only have {', '.join(name for _, name in factors)}; write one for each "
+            "Gaussian and channel",
         )
         fields["weights"] = _values(
             path, "weights", {name: single[name] for _, name in factors}, 1.0
@@ -302,7 +301,7 @@ def _check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: b
 def _values(
     path: Path, field: str, columns: dict[str, np.ndarray], scale: float
 ) -> Float[np.ndarray, "*shape"]:
-    with np.errstate(invalid="ignore"):  # of NaN that signals
+    with np.errstate(invalid="ignore"):  # from signaling NaN
         values = scale * np.stack(list(columns.values())).astype(np.float64)
     kind, *other_kinds = {column.dtype for column in columns.values()}
     is_encoded = field == "albedo" and not other_kinds and kind.kind in "iu"

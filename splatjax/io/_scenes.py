@@ -1,5 +1,5 @@
-"""Scenes as TOML files: splats or a mesh, material, lights, camera and settings. The manifest of a
-picture also describes a scene.
+"""Scenes in TOML files, with splats or a mesh, material, lights, camera and settings; and scenes in
+the manifests of pictures.
 """
 
 import json
@@ -56,15 +56,15 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
         bounces = 1
         diffusion = "clusters"       # exitance or shape
 
-    `read_observations` lists the entries of the other lights. A camera can instead be given by
-    `position`, `rotation`, `focal_length` and `principal_point`, or by `file`, `name` and
-    `mm_per_unit` (`load_cameras`). The weights of a material given by name
-    or file are divided by their sums if the splats have albedo, as on the command line.
+    `read_observations` lists the entries of the other lights. A camera may instead have `position`,
+    `rotation`, `focal_length` and `principal_point`, or `file`, `name` and `mm_per_unit`
+    (`load_cameras`). If the splats have an albedo, the weights of a material given by name or file
+    are divided by their sums, as on the command line.
 
-    **Arguments:** `path`: path of a TOML file, or of a picture that the command line rendered.
+    **Arguments:** `path`: a TOML file, or a picture that the command line rendered.
 
-    **Raises:** `ValueError` for any other content, with the fault and the remedy;
-    `FileNotFoundError` for a missing file.
+    **Raises:** `ValueError` for invalid content, with the fault and the remedy; `FileNotFoundError`
+    for a missing file.
     """
     file = scene_table(path)
     splats = _splats(file.table("splats", _BODY))
@@ -95,7 +95,7 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
 
 
 def scene_table(path: StrPath) -> Table:
-    """Return the contents of a scene's file, or of the manifest of a picture."""
+    """Return the contents of a scene file, or of the manifest of a picture."""
     path = Path(path)
     if path.suffix.lower() == ".exr":
         scene = read_manifest(path).get("scene")
@@ -113,10 +113,9 @@ def scene_table(path: StrPath) -> Table:
 
 
 def read_manifest(path: StrPath) -> dict[str, Any]:
-    r"""Read the manifest of a picture, as the command line records it: settings, material.
+    r"""Read the manifest of a picture, in which the command line records settings and material.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or has no such
-    record.
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read or has no manifest.
     """
     _, header, _ = read_planes(path)
     expect(
@@ -129,7 +128,7 @@ def read_manifest(path: StrPath) -> dict[str, Any]:
 
 
 def material_of_scene(file: Table) -> StrPath | Table:
-    """Return the name, path or tables of the material in a scene's file."""
+    """Return the name, path or tables of the material in a scene file."""
     name = file.entries.get("material")
     if not isinstance(name, str):
         return file.table("material", MATERIAL_TABLES)
@@ -137,7 +136,7 @@ def material_of_scene(file: Table) -> StrPath | Table:
 
 
 def mesh_of_scene(file: Table) -> Mesh | None:
-    """Return the mesh (mm) from which the splats in a scene's file are sampled, or `None`."""
+    """Return the mesh (mm) from which the splats of a scene file are sampled, or `None`."""
     table = file.table("splats", _BODY)
     if "file" in table.entries:
         return None
@@ -158,13 +157,13 @@ def save_scene(
     g: float = 0.0,
 ) -> None:
     r"""Write a scene to a TOML file, its splats to a PLY file of the same name, and images of its
-    environments to EXR files; `load_scene` reads them.
+    environments to EXR files, for `load_scene`.
 
-    Numbers are restored exactly, but splats and environments are stored in single precision. `g` is
-    the mean cosine of the material's phase function.
+    Numbers are restored exactly, except that splats and environments are stored in single
+    precision. `g` is the mean cosine of the material's phase function.
 
-    **Raises:** `ValueError` for settings other than bounces and diffusion, and for lights that no
-    file can store; `OSError` if a file cannot be written.
+    **Raises:** `ValueError` for settings other than bounces and diffusion, and for lights that a
+    file cannot store; `OSError` if a file cannot be written.
     """
     path, lights = Path(path), []
     plain = RenderSettings(bounces=settings.bounces, diffuser=settings.diffuser)
@@ -181,7 +180,7 @@ def save_scene(
             expect(
                 scene.material.wavelengths is None or light.image.shape[-1] == 1,
                 path,
-                "cannot store an environment of wavelengths; give a gray image, of one channel",
+                "cannot store a spectral environment; give a gray image of one channel",
             )
             write_image(image, light.image)
     write_splats(path.with_suffix(".ply"), scene.splats)
@@ -197,7 +196,7 @@ def plain_scene(
     settings: RenderSettings,
     g: float = 0.0,
 ) -> dict[str, Any]:
-    """Return the contents of a scene's file; [splats] and [[lights]] are given."""
+    """Return the contents of a scene file with given [splats] and [[lights]]."""
     kinds = {type(diffuser): name for name, diffuser in DIFFUSERS.items()}
     diffusion = kinds.get(type(settings.diffuser), "clusters")
     return {
@@ -223,7 +222,7 @@ def _splats(table: Table) -> Splats:
 
 
 def _body(table: Table) -> tuple[Path, dict[str, Any]]:
-    """Return the file of a body, with its unit and upward axis, and the maps of a mesh."""
+    """Return the file of a body, its unit and upward axis, and the maps of a mesh."""
     is_mesh = "mesh" in table.entries
     unit = table.number("mm_per_unit", None if is_mesh else 1.0)
     path = table.folder / table.text("mesh" if is_mesh else "file")

@@ -1,5 +1,5 @@
-"""Tables in files: TOML, with errors that name the valid entries, and measured profiles and media
-as CSV.
+"""Tables in files: TOML, with errors that list valid entries, and measured profiles and media in
+CSV.
 """
 
 import csv
@@ -28,7 +28,7 @@ Made = TypeVar("Made")
 def read_toml(path: Path, remedy: str) -> dict[str, Any]:
     """Read all tables of a TOML file.
 
-    **Raises:** `OSError` when it cannot be opened, `ValueError` when it is not TOML.
+    **Raises:** `OSError` if the file cannot be opened, `ValueError` if it is not TOML.
     """
     try:
         return tomllib.loads(existing_file(path).read_text(encoding="utf-8"))
@@ -37,15 +37,14 @@ def read_toml(path: Path, remedy: str) -> dict[str, Any]:
 
 
 class Table:
-    """A table of a TOML file, whose entries are checked as they are read.
+    """A table of a TOML file that checks entries as they are read.
 
-    **Raises:** `ValueError` for anything but a table, and for an entry that is not among the
-    `names`.
+    **Raises:** `ValueError` for anything but a table, and for an entry that is not in `names`.
     """
 
     def __init__(self, path: Path, name: str, entries: Any, names: Iterable[str]):
         self.path, self.name, self.entries = path, name, entries
-        self.folder = path.parent  # folder of the files that the table names
+        self.folder = path.parent  # folder for relative paths in the table
         self.where = f"{path}: [{name}]" if name else f"{path}:"
         self.expect(isinstance(entries, dict), f"must be a table; it is {entries!r}")
         unknown = sorted(entries.keys() - names)
@@ -58,7 +57,7 @@ class Table:
         return Table(self.path, f"{self.name} {name}".strip(), self.entries.get(name), names)
 
     def tables(self, name: str, names: Iterable[str]) -> "list[Table]":
-        """Return a list of tables within this one; errors number them from 1."""
+        """Return a list of tables within this one. Errors number them from 1."""
         value = self.entries.get(name)
         self.expect(
             isinstance(value, list) and value, f"{name} must be one table or more; it is {value!r}"
@@ -69,12 +68,12 @@ class Table:
         ]
 
     def expect(self, holds: Any, fault: str) -> None:
-        """Raise `ValueError` with the table and its fault unless a condition holds."""
+        """Raise `ValueError` with the table and the fault unless a condition holds."""
         if not holds:
             raise ValueError(f"{self.where} {fault}")
 
     def one_of(self, name: str, choices: Iterable[Any], default: Any = None) -> Any:
-        """Return an entry that is one of some choices."""
+        """Return an entry that must be one of the choices."""
         value = self.entries.get(name, default)
         near = difflib.get_close_matches(str(value).lower(), map(str, choices), n=1)
         self.expect(
@@ -85,14 +84,14 @@ class Table:
         return value
 
     def numbers(self, name: str, default: float | list[float] | None = None) -> Array:
-        """Return a number, a list of numbers or rows of them, in JAX's default precision.
+        """Return a number, a list of numbers or rows of numbers, in JAX's default precision.
 
-        The records made from them (`make`) check ranges and shapes.
+        Records (see `make`) check ranges and shapes.
         """
         value = self.entries.get(name, default)
         kinds = {type(leaf) for leaf in jax.tree.leaves(value)}
         if kinds and kinds <= {int, float}:
-            with suppress(TypeError, ValueError, OverflowError):  # rows of several lengths
+            with suppress(TypeError, ValueError, OverflowError):  # rows of unequal length
                 return jnp.asarray(rounded(value))
         self.expect(value is not None, f"{name} is missing; add it")
         raise ValueError(
@@ -111,13 +110,13 @@ class Table:
         return value
 
     def make(self, make: Callable[..., Made], *args: Any, **named: Any) -> Made:
-        """Make a record from entries; its errors name the table."""
+        """Call a function; its errors name the table."""
         with naming(self.where.rstrip(":")):
             return make(*args, **named)
 
     def record(self, cls: Any, **given: Any) -> Any:
-        """Make a record of a class from the entries of its fields, except for the given ones. A
-        missing entry is the default of its field.
+        """Make a record of a class from the entries of the fields that are not given. A missing
+        entry takes the default of the field.
         """
         for field in dataclasses.fields(cls):
             is_read = field.default is dataclasses.MISSING or field.name in self.entries
@@ -126,7 +125,7 @@ class Table:
         return self.make(cls, **given)
 
     def _field(self, name: str, kind: Any) -> Any:
-        """Read the entry of a field of some type: a truth value, a number, or numbers."""
+        """Read the entry of a field of a given type: a Boolean, a number, or numbers."""
         if kind is bool:
             return self.one_of(name, (True, False))
         if kind in (int, float):
@@ -136,7 +135,7 @@ class Table:
 
 
 def write_toml(path: StrPath, tables: Mapping[str, Any]) -> None:
-    """Write tables, with arrays of numbers on one line, completely or not at all."""
+    """Write tables to a TOML file, with arrays of numbers on one line, atomically."""
     number = r"-?(?:[\d.]+(?:e[+-]?\d+)?|inf|nan)"
     text = re.sub(
         rf"\[\s+((?:{number},\s+)+)\]",
@@ -152,36 +151,36 @@ def _as_toml(value: Any) -> str:
 
 
 def nearest(name: str, choices: Iterable[str]) -> str:
-    """Suggest the known name that is nearest to an unknown one, or list all of them."""
+    """Suggest the known name nearest to an unknown name, or list all known names."""
     choices = sorted(choices)
     near = [n for own in (name.lower(), name) for n in difflib.get_close_matches(own, choices, 1)]
     return f"did you mean {near[0]!r}?" if near else f"known are {', '.join(choices)}"
 
 
 def rounded(values: Any) -> np.ndarray:
-    """Round numbers to JAX's default precision; too large ones become infinite, small ones 0."""
+    """Round numbers to JAX's default precision. Numbers out of range become infinite or 0."""
     with np.errstate(over="ignore", under="ignore"):
         return np.asarray(values, np.float64).astype(jnp.result_type(float))
 
 
-# Units of length in the names of a table's columns.
+# Units of length in the column names of a table.
 _MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
 _COLUMNS = "sigma_a", "sigma_s_prime", "eta"
 
 
 def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
-    r"""Read a measured profile from a CSV file: a column of radii, and one of values for each
+    r"""Read a measured profile from a CSV file with a column of radii and one column of values per
     channel.
 
     Empty lines and lines that begin with `#` are ignored. The first line may contain names; a unit
-    in it must agree with `mm_per_unit`. Radii ascend.
+    in it must agree with `mm_per_unit`. Radii must ascend.
 
     **Arguments:** `mm_per_unit`: length of the file's unit, mm. Radii are in this unit, and values
-    per square of this unit.
+    in its inverse square.
 
     **Returns:** a `Tabulated` in JAX's default precision, mm and 1/mm^2.
 
-    **Raises:** `FileNotFoundError`, and `ValueError`, with line and cause, for another content.
+    **Raises:** `FileNotFoundError`; `ValueError`, with line and cause, for invalid content.
     """
     check_units(path, mm_per_unit)
     rows = _read_rows(path, "a profile is a CSV of radii and values")
@@ -213,15 +212,16 @@ def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
 
 
 def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
-    r"""Read media from a CSV file: a first line of names, then a line for each medium of one
+    r"""Read media from a CSV file with a line of column names and then one line per medium of one
     channel.
 
-    Columns are `sigma_a` and `sigma_s_prime` (1/mm), `eta`, and `name` if there is one. Empty lines
-    are left out.
+    Columns are `sigma_a` and `sigma_s_prime` (1/mm), `eta`, and optionally `name`. Empty lines are
+    ignored.
 
-    **Returns:** the names (numbers if there are none), and the three coefficients of each medium.
+    **Returns:** the names (numbers if the file has no names), and the three coefficients of each
+    medium.
 
-    **Raises:** `FileNotFoundError`, and `ValueError`, with line and cause, for another content.
+    **Raises:** `FileNotFoundError`; `ValueError`, with line and cause, for invalid content.
     """
     contents = f"media are a CSV of {', '.join(_COLUMNS)}"
     (_, head), *rows = _read_rows(path, contents) or [("", [])]
@@ -246,10 +246,9 @@ def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
 
 
 def write_columns(path: StrPath, columns: Mapping[str, Iterable]) -> None:
-    """Write a CSV table, completely or not at all, with enough digits to restore the numbers
-    exactly.
+    """Write a CSV table atomically, with enough digits to restore the numbers exactly.
 
-    **Raises:** `FileNotFoundError` when the folder does not exist.
+    **Raises:** `FileNotFoundError` if the folder does not exist.
     """
     plain = (
         [cell if isinstance(cell, str) else repr(float(cell)) for cell in column]
@@ -260,14 +259,14 @@ def write_columns(path: StrPath, columns: Mapping[str, Iterable]) -> None:
 
 
 def read_columns(path: StrPath) -> dict[str, tuple[str, ...]]:
-    """Read the cells of a table that `write_columns` has written."""
+    """Read the cells of a table that `write_columns` wrote."""
     with open(path, newline="", encoding="utf-8") as file:
         head, *rows = csv.reader(file)
     return dict(zip(head, zip(*rows, strict=True), strict=True))
 
 
 def _read_rows(path: StrPath, contents: str) -> list[tuple[str, list[str]]]:
-    """Read the rows of a CSV file and their line numbers, without empty ones and comments (`#`).
+    """Read the rows of a CSV file and their line numbers, without empty lines and comments (`#`).
 
     **Raises:** `FileNotFoundError`, or `ValueError` if it is not text.
     """

@@ -1,5 +1,5 @@
-"""Files read by trimesh. Contents that trimesh would misread are detected first; its exceptions
-become one-sentence errors, and ignored contents cause a warning.
+"""Reading of files by trimesh. Contents that trimesh would misread are detected first, its
+exceptions become one-sentence errors, and ignored contents cause a warning.
 """
 
 import json
@@ -27,7 +27,7 @@ _GLTF = rb"""
     |"baseColorTexture"\s*:\s*{[^{}]*(?:"texCoord"\s*:\s*[1-9]|{\s*"KHR_texture_transform")
     """
 # Contents that trimesh ignores or misreads: compressed, transformed and multiple textures, fans,
-# curves, polygons without three corners, and solids without an end.
+# curves, polygons with fewer than three corners, and solids without an end.
 _UNREAD = {
     "gltf": re.compile(_GLTF, re.VERBOSE),
     "obj": re.compile(
@@ -68,16 +68,16 @@ def _check_gltf(text: bytes) -> None:
             raise ValueError("its vertices are quantized")
 
 
-# Number of triangles that a file announces, for formats that announce it.
+# Number of triangles that a file declares, for formats that declare it.
 _COUNTS = {"obj": _count_obj, "off": _count_off, "gltf": _check_gltf}
 
 
 def _count_triangles(kind: str, data: bytes) -> int | None:
-    """Raise for contents that trimesh would misread; return the announced number of triangles."""
+    """Return the declared number of triangles; raise for contents that trimesh would misread."""
     if kind == "glb":
         kind, text = "gltf", data[20:][: int.from_bytes(data[12:16], "little")]
     elif kind == "stl" and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
-        text = b""  # it is binary
+        text = b""  # a binary file
     elif kind == "ply":
         text = data.partition(b"end_header")[0]
     else:
@@ -92,18 +92,18 @@ def _count_triangles(kind: str, data: bytes) -> int | None:
 
 @contextmanager
 def one_sentence(path: Path) -> Generator[None, None, None]:
-    """Convert exceptions of a library to an error that names the file, the reason and the remedy.
+    """Convert exceptions of a library to errors that name the file, the reason and the remedy.
 
-    **Raises:** `ValueError`; errors that already name the file pass.
+    **Raises:** `ValueError`; errors that already name the file pass unchanged.
     """
-    log = logging.getLogger("trimesh")  # it logs what is raised or ignored
+    log = logging.getLogger("trimesh")  # it logs errors and ignored contents
     before = log.level
     log.setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # NumPy's, of words among numbers
+            warnings.simplefilter("error", DeprecationWarning)  # NumPy's, for words among numbers
             yield
-    except Exception as error:  # each reader fails in its own way
+    except Exception as error:  # readers raise exceptions of any kind
         if isinstance(error, (ValueError, OSError)) and str(error).startswith(str(path)):
             raise
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__} "
@@ -116,18 +116,18 @@ def one_sentence(path: Path) -> Generator[None, None, None]:
 
 
 def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
-    """Read a file of some kind by trimesh.
+    """Read a file of a given kind by trimesh.
 
     Missing or unreadable pictures and materials are ignored with a warning.
 
-    **Returns:** the arguments of its meshes, as in the file; `contents`, the bytes of the file;
-    `triangles`, the announced number, or `None`; and `columns`, the properties of each element of a
+    **Returns:** the arguments of the meshes, as in the file; `contents`, the bytes of the file;
+    `triangles`, the declared number, or `None`; and `columns`, the properties of each element of a
     PLY file.
 
-    **Raises:** `ValueError` for contents that trimesh would misread, and when it reads fewer rows
-    than a PLY file promises.
+    **Raises:** `ValueError` for contents that trimesh would misread, and if it reads fewer rows
+    than a PLY file declares.
     """
-    from trimesh.exchange import load  # takes a second, so only where it is needed
+    from trimesh.exchange import load  # takes a second, so imported only here
 
     folder, data = _Folder(path), path.read_bytes()
     loaders, count = cast(dict[str, Any], load.mesh_loaders), _count_triangles(kind, data)
@@ -142,25 +142,25 @@ def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
 
 
 def _columns(name: str, element: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Return the properties of an element of a PLY file: a number or a list for each row."""
+    """Return the properties of an element of a PLY file, with a number or a list per row."""
     columns = {}
     for key in element["properties"] if element["length"] else ():
         column = np.asarray(element["data"][key])
         if column.dtype.names:
             sizes, column = column["f0"], column["f1"]
             if np.ptp(sizes):
-                raise ValueError(f"{key} are lists of several lengths, such as mixed polygons")
+                raise ValueError(f"{key} are lists of unequal lengths, such as mixed polygons")
         if len(column) != element["length"]:
-            raise ValueError(f"its header announces {element['length']} rows of {name}")
+            raise ValueError(f"its header declares {element['length']} rows of {name}")
         columns[key] = column[:, 0] if column.shape[1:] == (1,) else column
     return columns
 
 
 class _Folder:
-    """A resolver for the files beside a mesh, which records missing files."""
+    """A resolver for files beside a mesh that records missing files."""
 
     def __init__(self, path: Path):
-        from trimesh.resolvers import FilePathResolver  # never leaves the folder
+        from trimesh.resolvers import FilePathResolver  # stays within the folder
 
         self._files, self.file_name = FilePathResolver(str(path)), path.name
         self.faults: list[str] = []
@@ -170,8 +170,8 @@ class _Folder:
             data = self._files.get(unquote(name.replace("\\", "/")))
             if not name.strip().lower().endswith((".mtl", ".bin")):
                 Image.open(BytesIO(data)).close()
-        except Exception:  # each decoder fails in its own way
-            self.faults.append(f"names {name!r}, which is missing beside it, or is not a picture")
+        except Exception:  # decoders raise exceptions of any kind
+            self.faults.append(f"names {name!r}, which is missing, or is not a picture")
             raise
         return data
 

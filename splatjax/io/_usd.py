@@ -1,4 +1,4 @@
-"""Scenes as USD, by usd-core."""
+"""Writing of scenes as USD, by usd-core."""
 
 import warnings
 from collections.abc import Mapping
@@ -79,7 +79,7 @@ def Xform "scene"
     $lights
 }
 """)
-# The colors of the vertices, for both surfaces.
+# The vertex colors, for both surfaces.
 _ALBEDO = """
         def Shader "ND_geompropvalue_color3"
         {
@@ -108,20 +108,20 @@ _LIGHT = Template("""
 def save_usd(
     path: StrPath, scene: Scene, camera: Camera, *, mesh: Mesh | None = None, g: float = 0.0
 ) -> None:
-    r"""Write a scene as USD: triangles, an OpenPBR material, camera and lights, in meters.
+    r"""Write a scene as USD in meters: triangles, an OpenPBR material, camera and lights.
 
-    The color of the subsurface is the albedo of the splats, stored as vertex colors, if there is
-    one; else it is the color of the material. Renderers without OpenPBR show an opaque surface. The
-    image of an `EnvironmentLight` is written beside the file, as EXR.
+    If the splats have an albedo, it is stored as vertex colors and replaces the color of the
+    subsurface. Renderers without OpenPBR show an opaque surface. The image of an `EnvironmentLight`
+    is written beside the file, as EXR.
 
     **Arguments:**
 
     - `mesh`: closed triangles that bound the body, mm; `None` draws a hexagon for each splat.
-    - `g`: mean cosine of the phase function of the material's coefficients (`load_mean_cosine`).
+    - `g`: mean cosine of the material's phase function (`load_mean_cosine`).
 
     A warning names lights that USD cannot store.
 
-    **Raises:** `ValueError` for another suffix than .usda, .usdc or .usd, without usd-core, or for
+    **Raises:** `ValueError` for a suffix other than .usda, .usdc or .usd, without usd-core, and for
     a material of neither one nor three channels; `OSError` if the file cannot be written.
     """
     path = Path(path)
@@ -177,7 +177,7 @@ def _set_triangles(prim: Any, body: Mesh) -> None:
 
 
 def _surfaces(inputs: Mapping[str, list[float]], has_albedo: bool) -> tuple[str, str]:
-    """Return the inputs of OpenPBR, and of an opaque surface for renderers that lack it."""
+    """Format the inputs of OpenPBR, and of an opaque surface for renderers without OpenPBR."""
     values = {name: v[0] if len(v) == 1 else tuple(v) for name, v in inputs.items()}
     mtlx: dict[str, Any] = {
         f"{'float' if isinstance(value, float) else 'color3f'} inputs:{name}": value

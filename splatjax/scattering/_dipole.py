@@ -39,8 +39,8 @@ class AbstractHalfSpace(AbstractProfile):
 
 
 class AbstractDipole(AbstractHalfSpace):
-    r"""A source one mean free path `z_r` below the surface, its mirror image at `z_v = z_r + h`
-    above:
+    r"""A point source one mean free path `z_r` below the surface, and its mirror image at height
+    `z_v = z_r + h` above it:
 
         R(r) = alpha' / (4 pi) * { C_phi / D [exp(-s d_r) / d_r - exp(-s d_v) / d_v]
                                    + C_E * sum over z in (z_r, z_v) of
@@ -49,13 +49,12 @@ class AbstractDipole(AbstractHalfSpace):
     with `s = sigma_tr` and `d^2 = r^2 + z^2`.
 
     Fresnel transmission at entry and exit is not included. Differentiable in every coefficient and
-    in `r`; the derivatives at `r = 0` and, for the profile, at `sigma_a = 0` equal the one-sided
-    limits.
+    in `r`; the derivatives of the profile at `r = 0` and at `sigma_a = 0` are the one-sided limits.
     """
 
     @abc.abstractmethod
     def boundary(self) -> tuple[Array, Array, Array, Array | None]:
-        """Compute `sigma_tr^2`, `h`, `C_E`, and `C_phi / D`, which is None for a model without
+        """Compute `sigma_tr^2`, `h`, `C_E` and `C_phi / D`; the last is None for a model without
         fluence.
         """
 
@@ -71,8 +70,8 @@ class AbstractDipole(AbstractHalfSpace):
     def exitance(
         self, depth: Float[Array, "*shape"], squared_radius: Float[Array, "*shape"]
     ) -> Float[Array, "*shape"]:
-        """Compute the exitance, 1/mm^2, above a point source of unit power and its image; the last
-        axis is the channels.
+        """Compute the exitance, 1/mm^2, due to a point source of unit power and its image. The last
+        axis holds the channels.
         """
         u, height, flux, fluence = jax.tree.map(
             lambda constant: jnp.broadcast_to(constant, depth.shape), self.boundary()
@@ -93,9 +92,9 @@ class AbstractDipole(AbstractHalfSpace):
 
             alpha'/2 exp(-s z_r) { C_E (1 + exp(-s h)) + C_phi / D (1 - exp(-s h)) / s }
 
-        **Returns:** in [0, 1]; 1 where `sigma_a = 0`. There its derivative with respect to
-        `sigma_a` diverges like `-sigma_a^(-1/2)`, so that autodiff returns infinity at `sigma_a =
-        0`, on purpose.
+        **Returns:** in [0, 1]; 1 where `sigma_a = 0`. The derivative with respect to `sigma_a`
+        diverges like `-sigma_a^(-1/2)`, so at `sigma_a = 0` autodiff returns infinity, as it
+        should.
 
         **Source:** Jensen et al. 2001, section 2.4, for the classical dipole.
         """
@@ -109,7 +108,7 @@ class AbstractDipole(AbstractHalfSpace):
 
 @record
 class Dipole(AbstractDipole):
-    r"""The classical dipole: the profile of a half space, with which most fits are published.
+    r"""The classical dipole, a profile of a half space. Most published fits use it.
 
         Dipole(load_medium("marble"))(jnp.linspace(0.5, 2, 3))  # [radii, channels], 1/mm^2
 
@@ -137,13 +136,13 @@ class Dipole(AbstractDipole):
 
 @record
 class BetterDipole(AbstractDipole):
-    r"""The dipole of d'Eon, with Grosjean's diffusion coefficient and an exitance of fluence and
-    flux. It is more accurate than the classical one at strong absorption.
+    r"""D'Eon's dipole, with Grosjean's diffusion coefficient and an exitance that combines fluence
+    and flux. It is more accurate than the classical dipole where absorption is strong.
 
-    It is the sum of `AbstractDipole` with `D = (2 sigma_a + sigma_s') / (3 sigma_t'^2)`,
-    `sigma_tr^2 = sigma_a / D`, `A = (1 + 3 C2) / (1 - 2 C1)`, `z_r = 1 / sigma_t'`, `z_v = z_r + 4
-    A D`, `C_phi = (1 - 2 C1) / 4` and `C_E = (1 - 3 C2) / 2`, where `2 C1` and `3 C2` are the
-    moments of the internal reflectance (`AbstractFresnel`).
+    It is `AbstractDipole` with `D = (2 sigma_a + sigma_s') / (3 sigma_t'^2)`, `sigma_tr^2 = sigma_a
+    / D`, `A = (1 + 3 C2) / (1 - 2 C1)`, `z_r = 1 / sigma_t'`, `z_v = z_r + 4 A D`, `C_phi = (1 - 2
+    C1) / 4` and `C_E = (1 - 3 C2) / 2`, where `2 C1` and `3 C2` are the moments of the internal
+    reflectance (`AbstractFresnel`).
 
     **Attributes:**
 
@@ -169,7 +168,7 @@ def screening(y: Float[Array, "..."]) -> Float[Array, "..."]:
     r"""Compute `(1 + sqrt y) exp(-sqrt y)`, where `y = (sigma_tr d)^2` is at least 0; its
     derivative is `-exp(-sqrt y) / 2`.
 
-    The derivative rule is for `y = 0`, where the infinite derivatives of the square roots cancel.
+    The custom derivative is for `y = 0`, where the infinite derivatives of the square roots cancel.
     """
     root = jnp.sqrt(y)
     return (1 + root) * jnp.exp(-root)
@@ -206,7 +205,7 @@ fluence_difference.defjvps(
 
 
 def searchlight_scaling(albedo: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """Compute Burley's `s` for light that enters as a beam, and mean free paths.
+    """Compute Burley's scaling `s` for a beam, where `free_path` is the mean free path.
 
     **Source:** Christensen and Burley 2015.
     """
@@ -214,7 +213,8 @@ def searchlight_scaling(albedo: Float[Array, " channels"]) -> Float[Array, " cha
 
 
 def diffuse_scaling(albedo: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """Compute Burley's `s` for light that enters diffusely, and mean free paths.
+    """Compute Burley's scaling `s` for diffuse incident light, where `free_path` is the mean free
+    path.
 
     **Source:** Christensen and Burley 2015, Eq. 6.
     """
@@ -222,7 +222,7 @@ def diffuse_scaling(albedo: Float[Array, " channels"]) -> Float[Array, " channel
 
 
 def diffuse_mean_free_path_scaling(albedo: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """Compute Burley's `s` for light that enters as a beam, and diffuse mean free paths.
+    """Compute Burley's scaling `s` for a beam, where `free_path` is the diffuse mean free path.
 
     **Source:** Christensen and Burley 2015.
     """
@@ -231,19 +231,20 @@ def diffuse_mean_free_path_scaling(albedo: Float[Array, " channels"]) -> Float[A
 
 @record
 class Burley(AbstractProfile):
-    r"""Two exponentials that approximate Monte Carlo profiles, single scattering included.
+    r"""Normalized diffusion: two exponentials fitted to Monte Carlo profiles, including single
+    scattering.
 
         R(r) = A (exp(-r / d) + exp(-r / 3d)) / (8 pi d r),  d = free_path / s(A)
 
-    It diverges like 1/r at the origin: Eq. 3 is computed beyond a cut. Differentiable for `r > 0`.
+    It diverges like 1/r at the origin, so the integral of Eq. 3 starts at a cut. Differentiable for
+    `r > 0`.
 
     **Attributes:**
 
     - `albedo`: surface albedo A, the total reflectance, in [0, 1].
     - `free_path`: mm, positive.
-    - `scaling`: the published curve `s` for the kind of free path and the entry of light:
-      `searchlight_scaling` (default), `diffuse_scaling` or `diffuse_mean_free_path_scaling`.
-      Static.
+    - `scaling`: the published function `s(A)`: `searchlight_scaling` (default), `diffuse_scaling`
+      or `diffuse_mean_free_path_scaling`. Static.
 
     **Source:** Christensen and Burley 2015, "Approximate reflectance profiles for efficient
     subsurface scattering".

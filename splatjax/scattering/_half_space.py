@@ -1,6 +1,5 @@
-"""Light transport in a half space by adding and doubling the reflection and transmission of layers
-between discrete cosines: the fraction of light that leaves, by angle of entry, and the angular law
-of a material.
+"""Light transport in a half space by adding and doubling layers over discrete cosines: the
+directional albedo, and the angular law of a material.
 """
 
 from collections.abc import Callable
@@ -29,15 +28,15 @@ _DOUBLINGS, _COVER_DOUBLINGS = 22, 8
 
 @record
 class AngularLaw(eqx.Module):
-    r"""The dependence of diffused light on the angles of entry and exit.
+    r"""The dependence of multiply scattered light on the angles of entry and exit.
 
-    A profile describes light along the normal. Light that enters at the cosine `mu` is multiplied
-    by `e(mu) = sum_k c_k mu^k`, and by reciprocity light leaves in proportion to `e(mu)`.
-    Reflection at the surface is separate.
+    A profile describes light that enters along the normal. Light that enters at the cosine `mu` is
+    multiplied by `e(mu) = sum_k c_k mu^k`; by reciprocity, the radiance that leaves is proportional
+    to `e(mu)` too. Surface reflection is not included.
 
     **Attributes:**
 
-    - `coefficients`: `c_k`, the constant first; at most eight, of sum 1 in every channel.
+    - `coefficients`: `c_k`, the constant first; at most eight, with sum 1 in every channel.
       Differentiable.
 
     **Raises:** `ValueError` unless `e(1) = 1` and `e` is positive.
@@ -71,8 +70,8 @@ class AngularLaw(eqx.Module):
         total: Float[Array, " channels"],
         matrix: Float[Array, "channels colors"] | Float[np.ndarray, "channels colors"],
     ) -> "AngularLaw":
-        """Return the law for sums of channels, which are weighted by their total reflectance. A sum
-        that cancels to a tenth or less has the law of all light.
+        """Return the law of colors that are sums of the channels, weighted by total reflectance.
+        Where a sum cancels to a tenth or less, use the law of the sum over all channels.
         """
         shares = total[:, None] * matrix
         is_left = jnp.sum(shares, axis=0) > 0.1 * jnp.sum(jnp.abs(shares), axis=0)
@@ -87,21 +86,20 @@ class AngularLaw(eqx.Module):
 
 @record
 class HalfSpace(eqx.Module):
-    r"""The fraction of the light entering a half space that leaves it again, by angle of entry,
-    from light transport without the diffusion approximation.
+    r"""The fraction of the light entering a half space that leaves again, by angle of entry. It is
+    computed by light transport, without the diffusion approximation.
 
-    Adding and doubling: the reflection and transmission of a layer between discrete cosines give
-    those of two such layers, and so on to a half space. The surface is added last; it reflects from
-    inside, totally beyond the critical angle. The result does not depend on the division into
-    layers, so the first layer may be thick. The phase function is Henyey and Greenstein's; the
-    forward peak beyond its twelfth moment counts as unscattered (delta-M).
+    The method is adding and doubling: the reflection and transmission of a layer over discrete
+    cosines give the operators of two such layers, and so on until the layers form a half space. The
+    surface, with its internal reflection, is added last. The result does not depend on the division
+    into layers, so the first layer may be thick. The phase function is Henyey-Greenstein; its
+    forward peak beyond the twelfth moment counts as unscattered (delta-M).
 
     **Attributes:** (differentiable)
 
     - `medium`: its coefficients, [channels]; `eta` at least 1.
     - `g`: mean cosine of the phase function, [channels]; `sigma_s = sigma_s' / (1 - g)`.
-    - `cover`: a layer on the half space, thin or thick, with the index and mean cosine of the half
-      space; or `None`.
+    - `cover`: a layer of any thickness on the half space, with the same `eta` and `g`; or `None`.
 
     **Source:** Van de Hulst 1980 (doubling); Prahl, Van Gemert and Welch 1993 (adding the
     surface); Wiscombe 1977 (delta-M).
@@ -122,13 +120,13 @@ class HalfSpace(eqx.Module):
     def of_color(
         cls, color: Numbers, mean_free_path: Numbers, eta: Numbers = 1.4, g: Numbers = 0.0
     ) -> "HalfSpace":
-        r"""Compute the half space of a color, for materials of other renderers: the inverse of the
-        method `color`.
+        r"""Find the half space that has a given color, to convert materials of other renderers.
+        This is the inverse of the method `color`.
 
-        For OpenPBR, `color` is `subsurface_color`, `mean_free_path` the product of
-        `subsurface_radius` and `subsurface_radius_scale` in mm, `eta` is `specular_ior` and `g`
-        `subsurface_scatter_anisotropy`. For Blender's Principled BSDF: base color, radius times
-        scale, IOR and anisotropy of its random walk.
+        For OpenPBR, `color` is `subsurface_color`, `mean_free_path` is the product of
+        `subsurface_radius` and `subsurface_radius_scale` in mm, `eta` is `specular_ior`, and `g` is
+        `subsurface_scatter_anisotropy`. For Blender's Principled BSDF with random walk, they are
+        base color, radius times scale, IOR and anisotropy.
 
         **Arguments:** (one number for all channels, or one for each; differentiable except at a
         color of 1)
@@ -137,22 +135,22 @@ class HalfSpace(eqx.Module):
         - `mean_free_path`: `1 / sigma_t`, mm, positive.
         - `eta`, `g`: as in the attributes.
 
-        **Returns:** a half space whose `color()`, divided by that of a medium without absorption,
-        equals the given color within 1e-5.
+        **Returns:** a half space whose `color()`, divided by the color of the same medium without
+        absorption, equals the given color within 1e-5.
 
         **Raises:** `ValueError` for a number out of its range, and for unequal numbers of channels.
         """
         arrays = [jnp.atleast_1d(as_floats(value)) for value in (color, mean_free_path, eta, g)]
         sizes = [array.size for array in arrays]
         if len({*sizes} - {1}) > 1:
-            raise ValueError(f"color, mean_free_path, eta, g: {sizes} numbers; give one or as many")
+            raise ValueError(f"color, mean_free_path, eta, g have sizes {sizes}; give equal sizes")
         color, mean_free_path, eta, g = jnp.broadcast_arrays(*arrays)
         check_values("color", color, "between 0.001 and 1", lambda x: (x >= 1e-3) & (x <= 1))
         check_values("mean_free_path", mean_free_path, "positive (mm)", lambda x: x > 0)
         check_values("eta", eta, "at least 1", lambda x: x >= 1)
         check_values("g", g, "between -0.95 and 0.95", lambda x: abs(x) <= 0.95)
         absorbed = jax.vmap(_similarity_of_color)(color, eta, g) ** 2  # 1 - albedo'
-        # From the reduced albedo to that of the unreduced medium, without cancellation.
+        # From the reduced to the unreduced albedo, without cancellation.
         per_mm = (1 - g) / (1 - g * absorbed) / mean_free_path
         return cls(Medium(per_mm * absorbed, per_mm * (1 - absorbed), eta), g)
 
@@ -163,8 +161,8 @@ class HalfSpace(eqx.Module):
 
     @jit_unless_traced
     def directional_albedo(self) -> Float[Array, "angles channels"]:
-        """Compute the fraction of the light entering at each of `cosines` that leaves again, within
-        3e-4. Energy is conserved by construction.
+        """Compute the fraction of the light entering at each of `cosines` that leaves again. The
+        error is at most 3e-4, and energy is conserved by construction.
         """
         return self._by_channel(_directional_albedo).T
 
@@ -174,19 +172,19 @@ class HalfSpace(eqx.Module):
 
     @jit_unless_traced
     def color(self) -> Float[Array, " channels"]:
-        """Compute the color of a flat surface under even light: the fraction of the entered light
-        that leaves again. Light reflected by the surface itself does not count.
+        """Compute the color of a flat surface under uniform light: the fraction of the entering
+        light that leaves again. Surface reflection is not included.
         """
         return self._by_channel(_diffuse_albedo)
 
     def _by_channel(self, fraction: Callable[..., Array]) -> Float[Array, "channels *angles"]:
-        """Compute a fraction by `1 - albedo'`, index, g, and the cover's `1 - albedo'`, depth."""
+        """Compute a fraction of each channel from `1 - albedo'`, `eta`, `g` and the cover."""
         medium, cover = self.medium, self.cover
         layer = cover and (
             cover.medium.sigma_a / cover.medium.sigma_t_prime,
             cover.medium.sigma_t_prime * cover.thickness,
         )
-        # One channel at a time: with all at once, XLA never finishes compiling a fit as well.
+        # One channel at a time: if all were batched, XLA would never finish compiling a fit.
         inputs = medium.sigma_a / medium.sigma_t_prime, medium.eta, self.g, layer
         return jax.lax.map(lambda channel: fraction(*channel), inputs)
 
@@ -196,8 +194,8 @@ class HalfSpace(eqx.Module):
 
         **Arguments:**
 
-        - `separate`: the light that leaves by a separate law, at `cosines`, as
-          `SingleScattering.directional_albedo` computes it.
+        - `separate`: the part of the directional albedo at `cosines` that another law describes,
+          such as `SingleScattering.directional_albedo`. It is subtracted.
         """
         fraction = self.directional_albedo()
         if separate is not None:
@@ -214,13 +212,13 @@ class HalfSpace(eqx.Module):
 def _similarity_of_color(
     color: Float[Array, ""], eta: Float[Array, ""], g: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Find the root of `1 - albedo'` (similarity parameter), in which a color is almost linear."""
+    """Find the similarity parameter `sqrt(1 - albedo')`, in which the color is almost linear."""
 
     def excess(similarity, constants):
         color, eta, g, white = constants
         return _diffuse_albedo(similarity * similarity, eta, g) / white - color
 
-    # Without absorption, the color is 1 except for rounding; just below, it has a root.
+    # Without absorption the color is 1 up to rounding, so a target just below 1 always has a root.
     below = 1 - 16 * jnp.finfo(color.dtype).eps
     constants = below * color, eta, g, _diffuse_albedo(jnp.zeros_like(color), eta, g)
     ends = {"lower": jnp.zeros_like(color), "upper": jnp.full_like(color, 1 - 1e-6)}
@@ -231,7 +229,7 @@ def _similarity_of_color(
 
 def _directional_albedo(absorbed, eta, g, cover=None) -> Float[Array, " angles"]:
     """Compute the fraction of light, entering at each of `HalfSpace.cosines`, that leaves a half
-    space, by `1 - albedo'`. The cover is given by its own and its reduced optical depth.
+    space. `absorbed` is `1 - albedo'`; `cover` is that of the cover and its reduced optical depth.
     """
     mu, weights, reflected = _directions(eta)
     half_space = _doubled(mu, weights, absorbed, g)[1]
@@ -250,15 +248,15 @@ def _directional_albedo(absorbed, eta, g, cover=None) -> Float[Array, " angles"]
 
 
 def _doubled(mu, weights, absorbed, g, optical_depth=None):
-    """Return the transmission and reflection, between all cosines, of a layer with a given reduced
-    optical depth, or of a half space.
+    """Compute the transmission and reflection between all cosines, for a layer of a given reduced
+    optical depth or for a half space.
     """
     even, odd, albedo, lost, extinction = _redistribution(mu, weights, absorbed, g)
     doublings = _DOUBLINGS if optical_depth is None else _COVER_DOUBLINGS
     depth = _DEPTH if optical_depth is None else optical_depth * extinction / 2**doublings
 
-    # One layer, with the mean of its two sides for the light within: the even part of the light
-    # from both sides is attenuated by `with_even`, the odd part by `with_odd`.
+    # One layer, whose internal light is the mean of the light at its two sides: the even part of
+    # the light from both sides is attenuated by `with_even`, the odd part by `with_odd`.
     identity, half_depth = jnp.eye(len(mu), dtype=mu.dtype), 0.5 * depth / mu[:, None]
     losses = [half_depth * (identity - albedo * part) for part in (even, odd)]
     with_even, with_odd = (jnp.linalg.solve(identity + loss, identity - loss) for loss in losses)
@@ -285,15 +283,15 @@ def _doubled(mu, weights, absorbed, g, optical_depth=None):
 
 
 def _diffuse_albedo(absorbed, eta, g, cover=None) -> Float[Array, ""]:
-    """Compute the fraction of entered diffuse light that leaves again."""
+    """Compute the fraction of the entering diffuse light that leaves again."""
     mu, weights, reflected = (values[: _OUTSIDE + 1] for values in _directions(eta))
     entering = mu * weights * (1 - reflected)
     return jnp.vdot(entering, _directional_albedo(absorbed, eta, g, cover)) / jnp.sum(entering)
 
 
 def _directions(eta: Float[Array, ""]):
-    """Return the cosines inside, their weights, and the internal reflectance of the surface: first
-    for the refracted `HalfSpace.cosines`, then for cosines beyond the critical angle.
+    """Compute the cosines inside, their weights, and the internal reflectance of the surface: first
+    for the refracted `HalfSpace.cosines`, then beyond the critical angle.
     """
     nodes, node_weights = unit_legendre(_OUTSIDE)
     outside = jnp.asarray(HalfSpace.cosines(), eta.dtype)
@@ -310,8 +308,9 @@ def _directions(eta: Float[Array, ""]):
 
 
 def _redistribution(mu, weights, absorbed, g):
-    """Return the even and odd parts of the phase function between all cosines, times their weights;
-    the albedo, what is absorbed instead, and the reduced extinction, with the peak unscattered.
+    """Compute the even and odd parts of the phase function between all cosines, times their
+    weights, and then the albedo, `1 - albedo` and the relative extinction, all with the peak
+    unscattered.
     """
     polynomials = [jnp.ones_like(mu), mu]
     for n in range(1, _MOMENTS - 1):
@@ -324,7 +323,7 @@ def _redistribution(mu, weights, absorbed, g):
     even, odd = (
         by_moment[parity::2].T @ (legendre[parity::2] * weights[None]) for parity in (0, 1)
     )
-    even = even / jnp.sum(even, axis=1, keepdims=True)  # no energy is lost to rounding
+    even = even / jnp.sum(even, axis=1, keepdims=True)  # conserve energy exactly
     scattered = (1 - absorbed) * (1 - peak) / (1 - g)
     extinction = scattered + absorbed
     return even, odd, scattered / extinction, absorbed / extinction, extinction

@@ -1,5 +1,5 @@
-"""Media, the layers of a stack, and their interfaces: the Fresnel reflectance, its diffuse moments
-from inside, and the boundary of diffusion.
+"""Media, layers and interfaces: the Fresnel reflectance, its diffuse moments from inside, and the
+boundary condition of diffusion.
 """
 
 import abc
@@ -22,14 +22,13 @@ class Medium(eqx.Module):
         Medium([0.020, 0.006, 0.015], [1.1, 1.3, 1.5], eta=1.6)
         Medium((1 - albedo) * sigma_t, albedo * sigma_t * (1 - g), eta)  # of extinction and albedo
 
-    **Attributes:** (any number of channels; a single number is for all of them; differentiable)
+    **Attributes:** (any number of channels; a single number applies to all; differentiable)
 
     - `sigma_a`: absorption coefficient, 1/mm, at least 0.
     - `sigma_s_prime`: reduced scattering coefficient `sigma_s (1 - g)`, 1/mm, positive.
     - `eta`: index of refraction relative to air, positive.
 
-    **Raises:** `ValueError` for a value out of these ranges. Under `jit` values are unknown, and
-    not checked.
+    **Raises:** `ValueError` for a value out of these ranges. Traced values are not checked.
     """
 
     sigma_a: Float[Array, " channels"] = eqx.field(
@@ -58,8 +57,8 @@ class Medium(eqx.Module):
 
     @property
     def squared_sigma_tr(self) -> Float[Array, " channels"]:
-        """Square of the effective transport coefficient, `3 sigma_a sigma_t'`, 1/mm^2: smooth where
-        `sigma_a = 0`.
+        """Square of the effective transport coefficient, `3 sigma_a sigma_t'`, 1/mm^2. Unlike the
+        coefficient, it is smooth at `sigma_a = 0`.
         """
         return 3 * self.sigma_a * self.sigma_t_prime
 
@@ -86,8 +85,8 @@ class Layer(eqx.Module):
         return self.medium.channels
 
     def check_diffusion(self) -> None:
-        """Raise `ValueError` for a slab thinner than a mean free path, whose sources would be
-        outside of it. Traced values are not checked.
+        """Raise `ValueError` for a slab thinner than one mean free path: its sources would lie
+        outside. Traced values are not checked.
         """
         check_values(
             "thickness * sigma_t' of a Layer",
@@ -101,16 +100,16 @@ class Layer(eqx.Module):
 
 @record
 class Film(eqx.Module):
-    r"""A layer that absorbs and does not scatter, of negligible thickness.
+    r"""A layer of negligible thickness that absorbs without scattering.
 
-    It transmits `exp(-t)` of a beam from outside, and `2 E3(t)` of diffuse light, with t the
-    optical depth.
+    At the optical depth t it transmits `exp(-t)` of a beam from outside, and `2 E3(t)` of diffuse
+    light.
 
     **Attributes:**
 
     - `optical_depth`: absorption coefficient times thickness, at least 0. Differentiable.
 
-    **Source:** diffuse transmittance: the integral of `2 mu exp(-t / mu)` over the cosine.
+    **Source:** `2 E3(t)` is the integral of `2 mu exp(-t / mu)` over the cosine.
     """
 
     optical_depth: Float[Array, " channels"] = eqx.field(
@@ -119,9 +118,9 @@ class Film(eqx.Module):
 
 
 def check_stack(layers: tuple[Layer | Film, ...]) -> None:
-    """Raise `ValueError` for a stack without a layer that scatters, for numbers of channels that
-    differ (a film may have one channel), and for an infinite layer above another. Traced
-    thicknesses are not checked.
+    """Raise `ValueError` for a stack without a scattering layer, for unequal numbers of channels (a
+    film may have one channel), and for an infinite layer above another layer. Traced thicknesses
+    are not checked.
     """
     scattering = {layer.channels for layer in layers if isinstance(layer, Layer)}
     require(
@@ -166,15 +165,15 @@ class AbstractFresnel(eqx.Module):
 
 
 class ExactFresnel(AbstractFresnel):
-    r"""The moments as exact integrals, split at the critical angle.
+    r"""Compute the moments as exact integrals, split at the critical angle.
 
     Differentiable in `eta`. At `eta = 1` the moments are 0 and have a kink; the derivative there is
     the limit from above (7/3 for the first moment; from below it is -1/3).
 
-    The integral over the cosine outside, `mu_o`, is computed in `s = r_s`, the reflection
-    coefficient of the wave polarized across the plane of incidence: then `mu_o^2 = (eta^2 - 1)(1 -
-    s)^2 / 4s` and `r_p = (s - b) / (1 - b s)` with `b = (eta^2 - 1) / (eta^2 + 1)`, so that a power
-    of `eta^2 - 1` multiplies an integral that is finite at `eta = 1`.
+    The integral over the cosine outside, `mu_o`, is transformed to `s = r_s`, the reflection
+    coefficient of s-polarized light. Then `mu_o^2 = (eta^2 - 1)(1 - s)^2 / 4s` and `r_p = (s - b) /
+    (1 - b s)` with `b = (eta^2 - 1) / (eta^2 + 1)`, so a power of `eta^2 - 1` multiplies an
+    integral that is finite at `eta = 1`.
     """
 
     @jit_unless_traced
@@ -196,11 +195,12 @@ class ExactFresnel(AbstractFresnel):
 
 
 class EganFresnel(AbstractFresnel):
-    r"""The polynomial fits with which published profiles were computed.
+    r"""Compute the moments by the polynomial fits that published profiles use.
 
-    The first moment is the fit of Egan and Hilgeman as printed by Donner and Jensen, the second the
-    fit of d'Eon and Irving. They are valid for `eta` between about 0.5 and 2. Differentiable except
-    at `eta = 1`, where the fits step by 0.0017; there the moments are set to 0, so that A = 1.
+    The first moment is the fit of Egan and Hilgeman as printed by Donner and Jensen; the second is
+    the fit of d'Eon and Irving. They are valid for `eta` between about 0.5 and 2. Differentiable
+    except at `eta = 1`, where the fits step by 0.0017; there the moments are set to 0, so that A =
+    1.
 
     **Source:** Egan and Hilgeman 1979; Donner and Jensen 2005; d'Eon and Irving 2011.
     """
@@ -223,8 +223,8 @@ class EganFresnel(AbstractFresnel):
 def reflectance(
     inside: Float[Array, "*shape"], outside: Float[Array, "*shape"], eta: Float[Array, "*shape"]
 ) -> Float[Array, "*shape"]:
-    """Compute the reflectance of a smooth interface for unpolarized light from its cosines on both
-    sides; it is the same from either side.
+    """Compute the reflectance of a smooth interface for unpolarized light from the cosines on both
+    sides. It is the same from either side.
     """
     across = (eta * inside - outside) / (eta * inside + outside)
     along = (inside - eta * outside) / (inside + eta * outside)
@@ -236,23 +236,23 @@ def _polynomial(x: Float[Array, " channels"], *coefficients: float) -> Float[Arr
 
 
 def moment_outside(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """Compute twice the integral of `mu F(mu)` over the cosine on the rarer side of the interface,
-    where there is no total reflection.
+    """Compute twice the integral of `mu F(mu)` over the cosine on the rarer side, where there is no
+    total reflection.
     """
     ratio = _denser_over_rarer(eta)
     return (ratio * ratio - 1) / 8 * _over_reflections(ratio, jnp.ones_like)
 
 
 def _denser_over_rarer(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """Return the index of the denser side divided by that of the rarer side; at 1 the derivative is
-    the limit from above.
+    """Divide the index of the denser side by that of the rarer side. At 1 the derivative is the
+    limit from above.
     """
     return jnp.where(eta < 1, 1 / eta, eta)
 
 
 def _over_reflections(ratio: Float[Array, " channels"], factor) -> Float[Array, " channels"]:
-    """Integrate `(1 - s^2)(1 + (r_p / s)^2) factor(s)` from `s = (ratio - 1) / (ratio + 1)`, light
-    along the normal, to 1: the reflectance, `factor` and `16 mu_o dmu_o / (ratio^2 - 1)`.
+    """Integrate `(1 - s^2)(1 + (r_p / s)^2) factor(s)` from normal incidence, `s = (ratio - 1) /
+    (ratio + 1)`, to 1: the reflectance times `factor` and `16 mu_o dmu_o / (ratio^2 - 1)`.
     """
     normal = ((ratio - 1) / (ratio + 1))[None]
     b = 2 * normal / (1 + normal * normal)

@@ -24,16 +24,17 @@ _COSINES = 10
 
 @record
 class SingleScattering(AbstractProfile):
-    r"""Light scattered once in a half space, isotropically with the reduced coefficient: as a
-    profile, and as radiance in a picture.
+    r"""Light scattered once in a half space, isotropically with the reduced coefficient. It is
+    available as a profile and as radiance.
 
-    The profile is for light along the normal: after the scattering, light travels to the surface,
-    attenuated, and through the surface with the Fresnel transmittance. With theta the angle inside,
+    The profile is for light that enters along the normal. After the scattering event the light is
+    attenuated on its way to the surface and leaves with the Fresnel transmittance. With theta the
+    angle inside,
 
         R1(r) = alpha' sigma_t' / (4 pi r) * integral of exp(-sigma_t' r cot(theta / 2)) (1 - F)
         cos(theta) d theta.
 
-    Infinite at the origin like 1/r. Differentiable in every coefficient, and for `r > 0`.
+    It diverges like 1/r at the origin. Differentiable in every coefficient, and in `r > 0`.
 
     **Attributes:**
 
@@ -77,13 +78,13 @@ class SingleScattering(AbstractProfile):
     def reflected(
         self, mu_i: Float[Array, "*points"], mu_o: Float[Array, "*points"]
     ) -> Float[Array, "*points channels"]:
-        r"""Compute the radiance towards `wo` per irradiance that has entered from `wi`, of a flat
-        and evenly lit surface:
+        r"""Compute the radiance towards `wo`, per irradiance that entered from `wi`, of a flat and
+        uniformly lit surface:
 
             alpha' / 4 pi * (1 - F(mu_o)) / (eta^2 (mu_i' + mu_o')),
 
-        with the cosines `mu'` refracted. Times `mu_o` and integrated over all directions, with
-        light along the normal, it is the total reflectance.
+        where `mu'` are the refracted cosines. For light along the normal, its integral over all
+        directions, times `mu_o`, is the total reflectance.
 
         **Arguments:** `mu_i`, `mu_o`: cosines of `wi` and `wo` outside, in [0, 1]; clamped to at
         least 1e-4. Differentiable.
@@ -104,10 +105,10 @@ class SingleScattering(AbstractProfile):
 
     @jit_unless_traced
     def directional_albedo(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
-        """Compute the fraction of light, entering at the cosine `mu_i`, that leaves after one
-        scattering, with an error of 1e-3.
+        """Compute the fraction of the light entering at the cosine `mu_i` that leaves after one
+        scattering event. The error is at most 1e-3.
         """
-        # mu = t^2: the radiance has a root at grazing angles.
+        # Substitute mu = t^2, because the radiance behaves like a square root at grazing angles.
         parts = [
             float(4 * np.pi * weight * t**3) * self.reflected(mu_i, jnp.full_like(mu_i, t * t))
             for t, weight in zip(*unit_legendre(_COSINES), strict=True)
@@ -115,11 +116,11 @@ class SingleScattering(AbstractProfile):
         return functools.reduce(jnp.add, parts)
 
     def _escaping(self) -> tuple[Float[Array, "angles channels"], Float[Array, "angles channels"]]:
-        """Compute `tan(theta / 2)` of the angles at which light leaves, and their weights `(1 - F)
-        cos(theta) d theta`.
+        """Compute `tan(theta / 2)` of the angles at which light leaves, and their weights
+        `(1 - F) cos(theta) d theta`.
 
-        The angle is measured on the rarer side, where it takes all values: `sin(theta) = min(1, 1 /
-        eta) sin(psi)`.
+        The nodes are angles psi on the rarer side, which take all values:
+        `sin(theta) = min(1, 1 / eta) sin(psi)`.
         """
         eta = self.medium.eta
         x, beyond, weights = (
@@ -134,8 +135,8 @@ class SingleScattering(AbstractProfile):
         )
         reflected, weights = reflectance(cos_in, cos_out, eta), 0.5 * jnp.pi * weights * cosine
         # As eta goes to 1, light is reflected only at grazing angles, which the nodes do not
-        # resolve: the quadrature has the right value and the wrong derivative. One more node, at
-        # the grazing angle, restores the closed form.
+        # resolve: the value is right and the derivative is wrong. One more node, at the grazing
+        # angle, restores the closed form.
         missed = jnp.sum(weights * reflected * sine, axis=0) - 0.5 * moment_outside(self.medium.eta)
         grazing = stop_gradient(inside[0] / (1 + jnp.sqrt(1 - inside[0] ** 2)))
         half_angle = jnp.concatenate([inside * sine / (1 + cos_in), grazing[None]])
@@ -149,23 +150,23 @@ class PhotonBeam(AbstractHalfSpace):
     r"""Photon beam diffusion: the better dipole's exitance averaged over a beam's depth, plus
     single scattering.
 
-    Light enters as a beam along the normal and is scattered at depth z with density `sigma_t'
-    exp(-sigma_t' z)`. Multiple scattering is `alpha'^2 kappa E(z, r)`, with E the exitance above a
-    point source and the correction `kappa = 1 - exp(-2 sigma_t' (d_r + z))`. Single scattering,
-    isotropic, is attenuated on its way to the surface and transmitted with the Fresnel
-    transmittance; with theta the angle inside,
+    Light enters as a beam along the normal and is first scattered at depth z with density `sigma_t'
+    exp(-sigma_t' z)`. Multiple scattering is `alpha'^2 kappa E(z, r)`, with E the exitance due to a
+    point source and the correction `kappa = 1 - exp(-2 sigma_t' (d_r + z))`. Single scattering is
+    isotropic, attenuated on its way to the surface, and transmitted there; with theta the angle
+    inside,
 
         R1(r) = alpha' sigma_t' / (4 pi r) * integral of exp(-sigma_t' r cot(theta / 2)) (1 - F)
         cos(theta) d theta.
 
-    Infinite at the origin like 1/r: Eq. 3 is taken beyond a cut. Differentiable in every
-    coefficient, and for `r > 0`.
+    It diverges like 1/r at the origin, so the integral of Eq. 3 starts at a cut. Differentiable in
+    every coefficient, and in `r > 0`.
 
     **Attributes:**
 
     - `medium`: its coefficients, [channels]; scattering is isotropic with the reduced coefficient.
     - `fresnel`: the diffuse Fresnel moments of the surface that diffuse light meets.
-    - `strength`: a factor on multiple scattering, [channels]; 1 as published; `with_total` sets it.
+    - `strength`: factor of multiple scattering, [channels]; 1 as published. `with_total` sets it.
 
     **Source:** Habel, Christensen and Jarosz 2013, "Photon beam diffusion".
     """
@@ -180,8 +181,8 @@ class PhotonBeam(AbstractHalfSpace):
 
     @jit_unless_traced
     def with_total(self, total: Float[Array, " channels"]) -> "PhotonBeam":
-        """Scale multiple scattering so that the total reflectance is `total`, such as the total of
-        light transport (`HalfSpace`), from which the model's own total differs by 1 to 6%.
+        """Scale multiple scattering so that the total reflectance is `total`, for example that of
+        light transport (`HalfSpace`). The unscaled total differs from it by 1 to 6%.
         """
         single = SingleScattering(self.medium).total_reflectance()
         multiple = self.multiply_scattered().total_reflectance() / self.strength
@@ -198,8 +199,8 @@ class PhotonBeam(AbstractHalfSpace):
         )
 
     def multiply_scattered(self) -> AbstractProfile:
-        """Return the light scattered more than once as a profile, finite at `r = 0`: for a material
-        with a separate `SingleScattering`.
+        """Return the profile of light scattered more than once, which is finite at `r = 0`. Use it
+        for a material with a separate `SingleScattering`.
         """
         return _MultipleScattering(self.medium, self.fresnel, self.strength)
 
@@ -228,8 +229,8 @@ class _MultipleScattering(AbstractHalfSpace):
 
 @functools.cache
 def _beam() -> tuple[np.ndarray, np.ndarray]:
-    """Compute optical depths of sources and their weights `exp(-x) dx`, at equal steps of the
-    logarithm, so that all scales are resolved.
+    """Compute optical depths x of the sources and their weights `exp(-x) dx`, at equal steps of log
+    x to resolve all scales.
     """
     logarithm, step = np.linspace(-30.0, 3.9, _NODES, retstep=True)
     x = np.exp(logarithm)

@@ -1,4 +1,4 @@
-"""Profiles by wavelength as colors."""
+"""Conversion of spectral profiles to colors."""
 
 from typing import ClassVar
 
@@ -13,19 +13,19 @@ from splatjax.gaussians import AbstractProfile
 
 @record
 class Projected(AbstractProfile):
-    r"""A profile by wavelength, converted to red, green and blue by a matrix.
+    r"""A spectral profile, converted to red, green and blue by a matrix.
 
     Converting the profile instead of the picture is exact only if light and albedo are the same at
-    all wavelengths, and the kernel of pass 4 has gain 1 (`diffusion.PlainMean`, or flat surfaces).
-    With `EscapeNormalization` the gain on a curved body differs by wavelength: render the
-    wavelengths, and convert the picture.
+    all wavelengths and the kernel of pass 4 has gain 1 (`diffusion.PlainMean`, or flat surfaces).
+    With `EscapeNormalization` the gain on a curved body depends on the wavelength; render the
+    wavelengths and convert the picture instead.
 
     **Attributes:** (differentiable)
 
-    - `profile`: a profile of as many channels as the matrix has rows.
+    - `profile`: a profile with one channel per row of the matrix.
     - `matrix`: as `io.spectrum_to_rgb` computes it.
 
-    **Raises:** `ValueError` for a matrix of another number of rows.
+    **Raises:** `ValueError` for a matrix whose number of rows is not the number of channels.
     """
 
     profile: AbstractProfile
@@ -38,7 +38,7 @@ class Projected(AbstractProfile):
         if rows != channels:
             raise ValueError(
                 f"Projected.matrix has {rows} rows, and Projected.profile has {channels} channels; "
-                "give a row for each"
+                "give one row per channel"
             )
 
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:

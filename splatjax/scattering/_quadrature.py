@@ -1,6 +1,4 @@
-"""Radial integrals of profiles by one rule in units of the profile's length, and the inverse Hankel
-transform by a digital filter.
-"""
+"""Radial quadrature of profiles, and the inverse Hankel transform by a digital filter."""
 
 import abc
 import functools
@@ -10,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy  # its parts are loaded where they are used, which takes a third of a second
+import scipy  # submodules load on first use, which takes a third of a second
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
@@ -18,7 +16,7 @@ from splatjax.gaussians import AbstractProfile
 
 
 class AbstractRadialRule(eqx.Module):
-    """Nodes and weights of integrals over r."""
+    """Nodes and weights for integrals over r."""
 
     @abc.abstractmethod
     def radii(
@@ -29,22 +27,24 @@ class AbstractRadialRule(eqx.Module):
     @property
     @abc.abstractmethod
     def reaches_origin(self) -> bool:
-        """Whether the integral starts at 0, where some profiles are infinite."""
+        """Whether the integral starts at r = 0, where some profiles are infinite."""
 
 
 class RadialRule(AbstractRadialRule):
     r"""Nodes and weights for integrals over r in [0, inf), in units of a profile's
     `length_scale()`.
 
-    One Gauss-Legendre panel in log r from `smallest` to `largest`, and a linear one from 0 to
-    `smallest`. Equally spaced radii are unsuitable, because a profile changes over five decades.
+    The rule has one Gauss-Legendre panel in log r from `smallest` to `largest`, and a linear one
+    from 0 to `smallest`. Equally spaced radii are unsuitable, because a profile varies over five
+    decades of r.
 
     **Attributes:**
 
     - `smallest`, `largest`: ends of the logarithmic panel, in length scales.
     - `count`: number of nodes of the logarithmic panel.
     - `near`: number of nodes of the linear panel; 0 omits it.
-    - `tail`: a further power of r in the weights, for a better fit at large distances: 0 is Eq. 3.
+    - `tail`: exponent of an additional power of r in the weights, for a better fit at large
+      distances; 0 is Eq. 3.
     """
 
     smallest: float = eqx.field(static=True)
@@ -54,8 +54,8 @@ class RadialRule(AbstractRadialRule):
     tail: float = eqx.field(static=True, default=0.0)
 
     def beyond(self, cut: float, tail: float = 0.0) -> "RadialRule":
-        """Return the rule that starts at `cut` length scales: for profiles that are infinite or
-        unknown at the origin, and for radii that splats do not resolve.
+        """Return the rule that starts at `cut` length scales. Use it for profiles that are infinite
+        or unknown at the origin, and to leave out radii that splats do not resolve.
 
         **Raises:** `ValueError` unless `cut` is between 0 and the largest radius.
         """
@@ -71,9 +71,8 @@ class RadialRule(AbstractRadialRule):
     def radii(
         self, profile: AbstractProfile
     ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
-        """Compute the radii and weights for each channel, mm. Differentiable.
-
-        A measured profile has its own radii; those outside of the rule have weight 0.
+        """Compute the radii and weights for each channel, mm. Differentiable. A measured profile
+        has its own radii; radii outside the range of the rule have weight 0.
         """
         scale = profile.length_scale()
         measured = jax.lax.stop_gradient(profile.known_radii())
@@ -91,32 +90,32 @@ class RadialRule(AbstractRadialRule):
 
 
 L2_QUADRATURE = RadialRule(smallest=1e-3, largest=1e4, count=192)
-"""For integrals of `r R^2` (Eq. 3 and Eq. 4): the neglected tail of a medium without absorption is
-1e-16 of the integral.
+"""The rule for integrals of `r R^2` (Eq. 3 and Eq. 4). For a medium without absorption, the
+neglected tail is 1e-16 of the integral.
 
-The squared error of a fit must be accurate, which takes many nodes: with 128, an error of 1e-5 is
-wrong by a tenth; with 192, by 1e-7.
+An accurate squared error of a fit needs many nodes: at an error of 1e-5, 128 nodes are wrong by a
+tenth, 192 nodes by 1e-7.
 """
 
 L1_QUADRATURE = RadialRule(smallest=1e-3, largest=1e7, count=256)
-"""For integrals of `r R`, whose tails are long: without absorption they fall like 1/r, and 1e-7 is
-neglected.
+"""The rule for integrals of `r R`, which have long tails. Without absorption the tail falls like
+1/r, and 1e-7 of the integral is neglected.
 """
 
 
 class InverseVariance(AbstractRadialRule):
-    r"""The radii of a table, each weighted by its standard error: integrals of `r f(r)^2` become
-    sums of `f^2 / deviation^2`.
+    r"""The radii of a table, weighted by their standard errors: an integral of `r f(r)^2` becomes
+    the sum of `f^2 / deviation^2`.
 
     A fit with this rule minimizes chi-squared, and its `error` is `sqrt(chi_squared / sum((R /
-    deviation)^2))`. Radii with a standard error of 0, which no photon reached, are omitted.
+    deviation)^2))`. Radii with a standard error of 0, where no photon arrived, are omitted.
 
     **Attributes:**
 
-    - `among`: the rule that selects radii, in length scales of the profile: all by default, or
-      `L2_QUADRATURE.beyond(1.0)` for a cut.
+    - `among`: a rule whose range selects radii: all by default; `L2_QUADRATURE.beyond(1.0)` omits
+      radii below one length scale.
 
-    **Raises:** `ValueError`, when used, for a profile that has no `deviation`.
+    **Raises:** `ValueError` from `radii` for a profile without `deviation`.
     """
 
     among: RadialRule = L2_QUADRATURE
@@ -129,8 +128,8 @@ class InverseVariance(AbstractRadialRule):
         deviation = getattr(profile, "deviation", None)
         if deviation is None:
             raise ValueError(
-                f"{type(profile).__name__} has no standard errors to weight by; Tabulated(radii, "
-                "values, deviation) and monte_carlo(...).profile() have"
+                f"{type(profile).__name__} has no standard errors to weight by; use "
+                "Tabulated(radii, values, deviation) or monte_carlo(...).profile()"
             )
         r, dr = self.among.radii(profile)
         usable = (dr > 0) & (deviation > 0) & (r > 0)
@@ -150,10 +149,11 @@ def _nodes(smallest: float, largest: float, count: int, near: int) -> tuple[np.n
 
 @functools.cache
 def unit_interval() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute nodes x of the interval (0, 1), 1 - x without loss of digits, and weights, for
+    """Compute nodes x of the interval (0, 1), `1 - x` without cancellation, and weights, for
     integrands that are not smooth at the ends.
 
-    Takahasi and Mori's double exponential formula; the error of analytic integrands is about 1e-15.
+    This is Takahasi and Mori's double exponential formula; for analytic integrands the error is
+    about 1e-15.
     """
     t, step = np.linspace(-3.1, 3.1, 81, retstep=True)
     u = 0.5 * np.pi * np.sinh(t)
@@ -184,7 +184,7 @@ def integrated_reflectance(
     **Arguments:**
 
     - `profile`: Differentiable.
-    - `rule`: nodes; the integral ends at its largest radius.
+    - `rule`: the nodes; the integral ends at the largest radius of the rule.
 
     **Returns:** the fraction of the entering power that leaves, [channels].
     """
@@ -194,7 +194,7 @@ def integrated_reflectance(
 
 @functools.cache
 def unit_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Compute nodes of the interval (0, 1), and weights that sum to 1: the Gauss-Legendre rule."""
+    """Compute the Gauss-Legendre nodes of the interval (0, 1) and weights that sum to 1."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return 0.5 * (nodes + 1), 0.5 * weights
 
@@ -210,8 +210,8 @@ _PASSED = (
     22.0  # frequency up to which nothing is damped: exp(-pi/2 * 22) = 1e-15 bounds what lies above
 )
 _FIRST, _LAST = -20.0, 8.0  # logarithms of the abscissas
-_NEAR = 0.05  # in units of the decay: below this radius a series about the origin takes over
-_TERMS = 8  # of that series; the ratio of two is below 0.0025
+_NEAR = 0.05  # radius, in units of `decay`, below which a series about the origin is used
+_TERMS = 8  # of that series; the ratio of successive terms is below 0.0025
 _NEAR_NODES = 120
 
 
@@ -224,19 +224,19 @@ def inverse_hankel_transform(
     or a Bessel function.
 
     In the logarithm of the radius the transform is a convolution. The Mellin transform of the
-    kernel has modulus 1, and `F` is analytic in a strip, so that sampling both at equal steps of
-    the logarithm has only rounding errors, for every shape. The result is a plain, differentiable
-    sum over samples of `F`.
+    kernel has modulus 1 and `F` is analytic in a strip, so sampling both at equal steps of the
+    logarithm causes only rounding errors. The result is a plain, differentiable sum over samples of
+    `F`.
 
     **Arguments:**
 
-    - `transform`: computes `F` from `k` (1/mm) whose last axis is the channels, in the same shape;
-      it falls at least like `exp(-decay k)`.
+    - `transform`: computes `F` from `k` (1/mm), in the same shape; the last axis holds the
+      channels. `F` must fall at least like `exp(-decay k)`.
     - `r`: mm, at least 0. Differentiable, at 0 too.
-    - `decay`: mm, positive: places the nodes near the origin. Not differentiated.
+    - `decay`: mm, positive; it places the nodes near the origin. Not differentiated.
 
-    **Returns:** 1/mm^2. Its error is about 1e-15 of the value at `r = 0` or, farther out, of `1 /
-    (decay r)`: a smaller tail is rounding.
+    **Returns:** 1/mm^2. The error is about 1e-15 of the value at `r = 0` or, farther out, of `1 /
+    (decay r)`; a tail below that is rounding.
 
     **Source:** Johansen and Soerensen 1979, "Fast Hankel transforms"; the filter is our own.
     """
@@ -251,7 +251,7 @@ def inverse_hankel_transform(
     )
     x = abscissas / at[None]
     far = jnp.sum(weights * x * transform(x), axis=0) / at
-    # Near it: a series in (r / 2 decay)^2, whose coefficients are moments of F.
+    # Near the axis: a series in (r / 2 decay)^2, whose coefficients are moments of F.
     nodes, moments = (jnp.asarray(values, decay.dtype) for values in _half_line())
     terms = transform(nodes[:, None] / decay[None]) / (decay * decay)[None]
     coefficients = jnp.sum(moments[..., None] * terms[None], axis=1)

@@ -1,16 +1,17 @@
-"""Skin from its pigments: coefficients by wavelength, reflectance and profile.
+"""Optical properties of skin, computed from its pigments: coefficients by wavelength, reflectance
+and profile.
 
 Columns of the table of absorption, from 380 to 780 nm in steps of 5 nm:
 
 - Oxyhemoglobin and deoxyhemoglobin, molar extinction, 1/(cm mol/l): S. Prahl, "Tabulated molar
-  extinction coefficient for hemoglobin in water" (omlc.org/spectra/hemoglobin), of data by Gratzer
-  and by Kollias; the same as in the package SIMPA (MIT) from 450 nm on.
+  extinction coefficient for hemoglobin in water" (omlc.org/spectra/hemoglobin), from data of
+  Gratzer and Kollias; from 450 nm on the same as in the package SIMPA (MIT).
 - Water, absorption coefficient, 1/cm: Segelstein 1981, "The complex refractive index of water".
 - Beta-carotene in hexane and bilirubin in chloroform, molar extinction, 1/(cm mol/l): PhotochemCAD
   (Du et al. 1998; Dixon, Taniguchi and Lindsey 2005), edited by S. Prahl; means over 2 nm. Beyond
-  525 nm they are below the noise of the measurement, and taken as 0.
+  525 nm the values are below the noise of the measurement and are set to 0.
 
-The numbers are facts of measurement, published for use with citation. Melanins follow power laws.
+The numbers are measurements, published for use with citation. Melanins follow power laws.
 """
 
 from typing import Any, ClassVar
@@ -127,10 +128,10 @@ _COLUMNS = ("oxygenated", "deoxygenated", "water", "carotene", "bilirubin")
 def _pigment_absorption(
     wavelengths: Float[Array, " channels"],
 ) -> dict[str, Float[Array, " channels"]]:
-    r"""Compute absorption coefficients, 1/mm, at wavelengths in nm, linear between those of the
-    table: of whole blood with all of its hemoglobin `oxygenated` or `deoxygenated`, of `water`, of
-    a g/l of `carotene` and of `bilirubin`, of `eumelanin` and `pheomelanin` filling all of the
-    volume, and of bloodless tissue without pigment (`baseline`).
+    r"""Compute absorption coefficients, 1/mm, at wavelengths in nm, by linear interpolation of the
+    table. They are for whole blood with fully `oxygenated` or `deoxygenated` hemoglobin, `water`, 1
+    g/l of `carotene` and of `bilirubin`, pure `eumelanin` and `pheomelanin`, and bloodless tissue
+    without pigment (`baseline`).
 
     **Source:** blood with 150 g/l of hemoglobin: Prahl; melanins: Donner and Jensen 2006 (after
     Jacques), `6.6e10 l^-3.33` and `2.9e14 l^-4.75`; baseline: Jacques 1998 (after Saidi),
@@ -154,33 +155,34 @@ def _between(least: float, most: float, unit: str = "") -> dict[str, Any]:
 
 @record
 class Skin(eqx.Module):
-    r"""Skin as a thin epidermis with melanin on a deep dermis with blood, by wavelength.
+    r"""Skin, modeled by wavelength as a thin epidermis with melanin on a deep dermis with blood.
 
-    Absorption is the sum over the contents of each layer; the rest is bloodless tissue. Both layers
-    have the reduced scattering coefficient `scattering * (l / 500 nm)^-scattering_power` at the
-    wavelength `l`. All parameters except the wavelengths are numbers, and differentiable; use
+    The absorption of a layer is the sum over its contents; the remainder is bloodless tissue. Both
+    layers have the reduced scattering coefficient `scattering * (l / 500 nm)^-scattering_power` at
+    the wavelength `l`. All parameters except the wavelengths are differentiable numbers; use
     `jax.vmap` for many skins.
 
     **Attributes:**
 
-    - `melanin`: fraction of the epidermis filled by melanosomes: 0.01 to 0.06 in light skin, 0.1 to
+    - `melanin`: volume fraction of melanosomes in the epidermis: 0.01 to 0.06 in light skin, 0.1 to
       0.4 in dark skin.
-    - `blood`: fraction of the dermis, on average over its depth; 0.005 to 0.015 fit measured skin.
+    - `blood`: volume fraction of blood in the dermis, averaged over depth; 0.005 to 0.015 fit
+      measured skin.
     - `oxygenation`: fraction of the hemoglobin that carries oxygen: 0.52 to 0.67 on forehead,
       forearm, back of the hand, trunk and legs; 0.9 at the tips of fingers and toes.
-    - `eumelanin`: fraction of the melanin; the rest is pheomelanin.
+    - `eumelanin`: fraction of the melanin that is eumelanin; the rest is pheomelanin.
     - `carotene`, `bilirubin`: g/l; carotene is in both layers, bilirubin in the dermis.
-    - `water`: fraction of both layers.
-    - `vessel_radius`: mm. Blood in vessels shadows itself, which flattens its absorption bands.
+    - `water`: volume fraction of water in both layers.
+    - `vessel_radius`: mm. Blood in a vessel shadows itself, which flattens its absorption bands.
     - `thickness`: thickness of the epidermis, mm; it may be thinner than a mean free path.
-    - `scattering`: reduced scattering coefficient at 500 nm, 1/mm; `scattering_power`: the power of
-      its decrease with the wavelength.
-    - `eta`: index of refraction: that of the surface of the skin, through which light leaves; 1.4
-      is that of the tissue below. `g`: mean cosine of the phase function.
-    - `wavelengths`: nm, of the channels; by default 400 to 700 in steps of 10.
+    - `scattering`: reduced scattering coefficient at 500 nm, 1/mm; `scattering_power`: the exponent
+      of its decrease with the wavelength.
+    - `eta`: index of refraction of the surface, through which light leaves (that of the tissue
+      below is 1.4); `g`: mean cosine of the phase function.
+    - `wavelengths`: the channels, nm; by default 400 to 700 in steps of 10.
 
-    **Raises:** `ValueError` for a value out of its range, for more water and blood than the whole,
-    and without wavelengths.
+    **Raises:** `ValueError` for a value out of its range, for water and blood that exceed 1
+    together, and without wavelengths.
 
     **Source:** two layers, melanins and baseline: Donner and Jensen 2006; scattering of skin, a
     mean over published measurements: Jacques 2013; eumelanin's share: Del Bino et al. 2015;
@@ -268,14 +270,14 @@ class Skin(eqx.Module):
         return Layer(epidermis, self.thickness), Layer(dermis, jnp.inf)
 
     def half_space(self) -> HalfSpace:
-        """Return the dermis with the epidermis as its cover: total reflectance, diffuse color and
-        angles by light transport.
+        """Return the dermis with the epidermis as its cover, for total reflectance, color and
+        angular law by light transport.
         """
         epidermis, dermis = self.layers()
         return HalfSpace(dermis.medium, jnp.full_like(self.wavelengths, self.g), epidermis)
 
     def profile(self) -> "SkinProfile":
-        """Return the profile of light along the normal, with the total of light transport."""
+        """Compute the profile for light along the normal; its total is that of light transport."""
         (epidermis, dermis), whole = self.media(), self.half_space()
         black = Medium(1e6 * dermis.sigma_s_prime, dermis.sigma_s_prime, dermis.eta)
         shallow = HalfSpace(black, whole.g, whole.cover).total_reflectance()
@@ -284,23 +286,23 @@ class Skin(eqx.Module):
 
 @record
 class SkinProfile(AbstractProfile):
-    r"""The profile of a dermis under a thin epidermis: the reflectance of the epidermis alone, and
-    the rest, each a photon beam scaled to its total.
+    r"""The profile of a dermis under a thin epidermis. The reflectances of the epidermis alone and
+    of the dermis below it are photon beam profiles, each scaled to its total.
 
-    The epidermis attenuates the light of the dermis at its exit. The profile diverges like 1/r at
-    the origin. The total is computed by light transport.
+    The epidermis only attenuates the light of the dermis; `Skin.profile` computes both totals by
+    light transport. The profile diverges like 1/r at the origin.
 
-    Compared with Monte Carlo of `g=0` in rings 0.1 to 1 mm wide: with `melanin=0.02`, within 8% up
-    to 3 mm at 620 nm, and within 12% up to 1.5 mm at 450 nm; beyond, where 2% of the light leaves,
-    up to 50% too large. With `melanin=0.3` at 620 nm, within 33% up to 2 mm; beyond, where an
-    eighth of the light leaves, up to 70% too large. With the default `g=0.8`, the total is as
-    right, but the profile spreads light by its reduced scattering: up to 0.1 mm from the point of
-    entry it is 20 to 70% too large, and from 0.2 to 0.75 mm 10 to 35% too small.
+    Errors against Monte Carlo with `g=0`, in rings 0.1 to 1 mm wide: for `melanin=0.02`, at most 8%
+    up to 3 mm at 620 nm and 12% up to 1.5 mm at 450 nm; farther out, where 2% of the light leaves,
+    the profile is up to 50% too large. For `melanin=0.3` at 620 nm, at most 33% up to 2 mm; farther
+    out, where an eighth of the light leaves, it is up to 70% too large. With the default `g=0.8`
+    the total is as accurate, but the profile uses reduced scattering: it is 20 to 70% too large up
+    to 0.1 mm from the point of entry, and 10 to 35% too small from 0.2 to 0.75 mm.
 
     **Attributes:** (differentiable)
 
     - `dermis`, `epidermis`: their coefficients.
-    - `deep`, `shallow`: the total reflectance of either, [channels].
+    - `deep`, `shallow`: the total reflectance of the dermis and of the epidermis, [channels].
     """
 
     dermis: Medium

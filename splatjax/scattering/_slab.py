@@ -1,5 +1,5 @@
-"""Profiles of slabs and of stacks of layers: reflection and transmission in the Hankel domain, and
-adding of layers.
+"""Profiles of slabs and of stacks of layers, by adding their reflection and transmission in the
+Hankel domain.
 """
 
 import abc
@@ -18,7 +18,7 @@ from ._quadrature import inverse_hankel_transform, unit_interval
 
 
 class Response(eqx.Module):
-    """Reflectance and transmittance of layers, in the Hankel domain, from above and from below."""
+    """Reflectance and transmittance of layers from above and from below, in the Hankel domain."""
 
     reflectance_above: Float[Array, "*shape"]
     transmittance_down: Float[Array, "*shape"]
@@ -42,7 +42,7 @@ class Response(eqx.Module):
 
 
 def film_response(film: Film, lit_by_beam: bool, shape: tuple[int, ...]) -> Response:
-    """Compute the response of a film; `lit_by_beam` if no layer above has scattered the incident
+    """Compute the response of a film. `lit_by_beam` is true if no layer above scatters the incident
     light.
     """
     depth = jnp.broadcast_to(film.optical_depth, shape)
@@ -52,8 +52,8 @@ def film_response(film: Film, lit_by_beam: bool, shape: tuple[int, ...]) -> Resp
 
 
 def diffuse_transmittance(optical_depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Compute `2 E3(t)`, the integral of `2 mu exp(-t / mu)` over the cosine: 1 at t = 0, with the
-    derivative -2.
+    """Compute `2 E3(t)`, the integral of `2 mu exp(-t / mu)` over the cosine. At t = 0 it is 1, and
+    its derivative is -2.
     """
     mu, _, weights = (
         jnp.asarray(values, optical_depth.dtype).reshape(-1, *[1] * optical_depth.ndim)
@@ -69,8 +69,8 @@ def slab_response(
     fresnel: AbstractFresnel,
     k: Float[Array, "*shape"],
 ) -> Response:
-    r"""Compute the response of a slab: the infinite series of Donner and Jensen's multipole,
-    summed.
+    r"""Compute the response of a slab: Donner and Jensen's multipole, with its infinite series in
+    closed form.
 
     With `s^2 = sigma_tr^2 + k^2`, `l = 1 / sigma_t'`, extrapolated boundaries `z_a` above and `z_b`
     below, and `H = d + z_a + z_b`,
@@ -78,13 +78,13 @@ def slab_response(
         R(k) = alpha' sinh(s (d - l + z_b)) cosh(s z_a) / sinh(s H),
         T(k) = alpha' sinh(s (l + z_a)) cosh(s z_b) / sinh(s H),
 
-    and the same with z_a and z_b exchanged from below. NaN for a slab thinner than l.
+    and the same from below with z_a and z_b exchanged. A slab thinner than l gives NaN.
 
     **Arguments:**
 
     - `eta_above`, `eta_below`: indices of the neighbors relative to air.
-    - `fresnel`: the diffuse Fresnel moments of either side.
-    - `k`: 1/mm, at least 0; the last axis is the channels.
+    - `fresnel`: computes the diffuse Fresnel moments of both sides.
+    - `k`: 1/mm, at least 0; the last axis holds the channels.
 
     **Source:** image positions: Donner and Jensen 2005; the sum is our own.
     """
@@ -127,10 +127,11 @@ def hyperbolic_ratio(
     r"""Compute `sinh(s a) cosh(s b) / sinh(s height)` with `s = sqrt(u)`, where `height = a + b +
     fall` and nothing is negative.
 
-    It is an even function of s, hence smooth in u; a series about `u = 0` keeps its derivatives.
+    The function is even in s and hence smooth in u; a series about `u = 0` gives the right
+    derivatives.
     """
     small = u * height * height < _SMALL
-    # Near 0, as a sum of logarithms of sinh(x) / x and of cosh(x).
+    # Near 0: sum the series of the logarithms of sinh(x) / x and cosh(x).
     v = jnp.where(small, u, 0.0)
     y = v * b * b
     log_cosh = y * (1 / 2 - y * (1 / 12 - y * (1 / 45 - y * (17 / 2520))))
@@ -142,7 +143,7 @@ def hyperbolic_ratio(
 
 
 def _log_sinhc(y):
-    """`log(sinh(x) / x)` for small `y = x^2`."""
+    """Compute `log(sinh(x) / x)` for small `y = x^2`."""
     return y * (1 / 6 - y * (1 / 180 - y * (1 / 2835 - y / 37800)))
 
 
@@ -151,7 +152,8 @@ _SHALLOWEST = 1e-3
 
 
 class AbstractSlabProfile(AbstractProfile):
-    """A profile with a transmittance beside its reflectance; both are inverse Hankel transforms.
+    """A profile of slabs, with both a reflectance and a transmittance, computed as inverse Hankel
+    transforms.
 
     **Attributes:** (by keyword)
 
@@ -166,7 +168,7 @@ class AbstractSlabProfile(AbstractProfile):
     @property
     @abc.abstractmethod
     def stack(self) -> tuple[Layer | Film, ...]:
-        """All layers, from the top."""
+        """Return all layers, from the top."""
 
     def __check_init__(self):
         check_stack(self.stack)
@@ -175,7 +177,7 @@ class AbstractSlabProfile(AbstractProfile):
 
     @property
     def top(self) -> Layer:
-        """The uppermost layer that scatters."""
+        """Return the uppermost layer that scatters."""
         return self._scattering()[0]
 
     def _scattering(self) -> list[Layer]:
@@ -196,8 +198,8 @@ class AbstractSlabProfile(AbstractProfile):
         return reduce(Response.over, responses)
 
     def decay_lengths(self) -> tuple[Float[Array, " channels"], Float[Array, " channels"]]:
-        """Compute lengths `a` (mm) such that reflectance and transmittance fall like `exp(-a k)` or
-        faster: the depths of the sources from either side.
+        """Compute the lengths a (mm) such that reflectance and transmittance fall at least like
+        `exp(-a k)`: the depths of the sources from the two sides.
         """
         depths = [1 / layer.medium.sigma_t_prime for layer in self._scattering()]
         # An infinite layer transmits nothing; any length is valid.
@@ -241,7 +243,7 @@ class AbstractSlabProfile(AbstractProfile):
 
 
 class Transmitted(AbstractProfile):
-    """The light that leaves a slab on the far side, as a profile."""
+    """The profile of the light that leaves a slab on the far side."""
 
     slab: AbstractSlabProfile
 
@@ -253,17 +255,17 @@ class Transmitted(AbstractProfile):
         return self.slab.total_transmittance()
 
     def length_scale(self) -> Float[Array, " channels"]:
-        """Return the mean free path, or the depth below the last source if that is larger, mm."""
+        """Return the mean free path or, if larger, the slab's depth below the last source, mm."""
         return jnp.maximum(self.slab.length_scale(), self.slab.decay_lengths()[1])
 
 
 @record
 class Multipole(AbstractSlabProfile):
-    r"""The dipole of a slab: the infinite series of images between both of its sides, summed in
+    r"""The multipole of a slab: the infinite series of image sources at both sides, summed in
     closed form in the Hankel domain.
 
-    A slab many mean free paths thick becomes `Dipole`. Differentiable in every coefficient, in the
-    thickness, and in `r`.
+    For a slab many mean free paths thick it equals `Dipole`. Differentiable in every coefficient,
+    in the thickness, and in `r`.
 
     **Attributes:**
 
@@ -271,8 +273,8 @@ class Multipole(AbstractSlabProfile):
     - `eta_above`, `eta_below`, `fresnel`: as in `AbstractSlabProfile`.
 
     **Raises:** `ValueError` for a layer thinner than one mean free path `1 / sigma_t'` in any
-    channel: its sources would be outside of it. Under `jit` this cannot be checked, and the profile
-    is NaN.
+    channel, because its sources would lie outside. For traced values there is no error, and the
+    profile is NaN.
 
     **Source:** Donner and Jensen 2005, "Light diffusion in multi-layered translucent materials".
     """
@@ -291,24 +293,23 @@ class LayeredMultipole(AbstractSlabProfile):
         glazed = LayeredMultipole([Layer(glaze, 0.5), Layer(stone, jnp.inf)])  # from the top, mm
         glazed(jnp.linspace(0.5, 2, 3))  # [radii, channels], 1/mm^2
 
-    Each layer is a multipole; they are combined by adding, in the Hankel domain.
-
-    Between two scattering layers the interface has the ratio of their indices; a film has no
-    interface. Light enters from above as a narrow beam. Each slab has its own extrapolated
-    boundaries. Dividing a slab into two layers of the same medium therefore changes the result, by
-    a few per cent for a slab four mean free paths thick.
+    Each layer is a multipole; the layers are combined by adding, in the Hankel domain. The
+    interface between two scattering layers has the ratio of their indices; a film has no interface.
+    Light enters from above as a narrow beam. Each slab has its own extrapolated boundaries, so
+    dividing a slab into two layers of the same medium changes the result, by a few per cent for a
+    slab four mean free paths thick.
 
     Differentiable in every coefficient and thickness, and in `r`.
 
     **Attributes:**
 
-    - `layers`: `Layer` and `Film`, from the top; at least one scatters. Only the lowest may be
-      infinite.
+    - `layers`: `Layer` and `Film` records, from the top; at least one is a `Layer`. Only the lowest
+      may be infinite.
     - `eta_above`, `eta_below`, `fresnel`: as in `AbstractSlabProfile`.
 
-    **Raises:** `ValueError` for no scattering layer, for numbers of channels that differ, for an
-    infinite layer with another below it, and for a layer thinner than one mean free path `1 /
-    sigma_t'` in any channel. Under `jit` this cannot be checked, and the profile is NaN.
+    **Raises:** `ValueError` without a scattering layer, for unequal numbers of channels, for an
+    infinite layer above another layer, and for a layer thinner than one mean free path `1 /
+    sigma_t'` in any channel. For traced values there is no error, and the profile is NaN.
 
     **Source:** Donner and Jensen 2005, "Light diffusion in multi-layered translucent materials".
     """
@@ -317,7 +318,7 @@ class LayeredMultipole(AbstractSlabProfile):
 
     @property
     def stack(self) -> tuple[Layer | Film, ...]:
-        """All layers, adjacent films joined: light is not diffused between them."""
+        """Return all layers; adjacent films are joined, as no light is diffused between them."""
         joined: list[Layer | Film] = []
         for layer in self.layers:
             if joined and isinstance(layer, Film) and isinstance(joined[-1], Film):

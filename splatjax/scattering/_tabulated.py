@@ -9,29 +9,28 @@ from splatjax._chunking import jit_unless_traced
 from splatjax._records import Numbers, check_values, numbers, record, valid
 from splatjax.gaussians import AbstractProfile
 
-# Fraction of the peak above which pixels determine the center.
+# Pixels brighter than this fraction of the peak determine the center.
 _CORE = 0.2
 
-# Least pixels of a ring; with fewer, their scatter hardly determines the error of the mean.
+# Least number of pixels in a ring; fewer do not determine the error of the mean.
 _LEAST_PIXELS = 12
 
 
 @record
 class Tabulated(AbstractProfile):
-    r"""A profile given at radii, linear between them, constant within the first and 0 beyond the
-    last.
+    r"""A profile given by a table: linear between its radii, constant below the first and 0 beyond
+    the last.
 
-    Nothing is extrapolated: light beyond the last radius counts only if `total` is given.
-    Integrals, including those of a fit, are sums over the given radii. Differentiable in values,
-    radii, `r`, and the total.
+    Light beyond the last radius counts only if `total` is given. Integrals, including those of a
+    fit, are sums over the given radii. Differentiable in values, radii, `r`, and the total.
 
     **Attributes:**
 
-    - `radii`: mm, at least two; they ascend from at least 0.
+    - `radii`: mm, at least two, ascending, not negative.
     - `values`: 1/mm^2, one row per radius. Noise may make them negative.
-    - `deviation`: standard errors of the values, with the same shape, or None if they are unknown.
-      Derivatives treat them as constants.
-    - `total`: the total reflectance of each channel; None for the integral of the straight lines.
+    - `deviation`: standard errors of the values, in the same shape, or None if unknown. Derivatives
+      treat them as constants.
+    - `total`: the total reflectance of each channel; None to integrate the table.
 
     **Raises:** `ValueError` for radii that do not ascend, for values that are not finite, and for
     shapes that do not match.
@@ -68,7 +67,7 @@ class Tabulated(AbstractProfile):
         return jnp.stack(columns, axis=-1).reshape(*r.shape, -1)
 
     def without(self, profile: AbstractProfile) -> "Tabulated":
-        """Subtract a profile, such as single scattering, to fit the rest."""
+        """Subtract another profile, such as single scattering, to fit what remains."""
         if profile.singular:
             requirement = (
                 f"above 0, because {type(profile).__name__} is infinite at r = 0; leave that "
@@ -80,8 +79,8 @@ class Tabulated(AbstractProfile):
 
     @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Return the total, or compute `2 pi` times the integral of `r R(r)`, exact for the
-        straight lines.
+        """Return `total` if it is given; otherwise compute `2 pi` times the integral of `r R(r)`,
+        exactly for linear interpolation.
         """
         if self.total is not None:
             return self.total
@@ -92,17 +91,15 @@ class Tabulated(AbstractProfile):
 
     @jit_unless_traced
     def length_scale(self) -> Float[Array, " channels"]:
-        """Compute the radius, mm, within which half of the integral of `r |R|` lies, in steps of
-        the table.
-        """
+        """Return the radius of the table, mm, within which half of the integral of `r |R|` lies."""
         rings = self.radii * jnp.diff(self.radii, append=self.radii[-1:])
         within = jnp.cumsum(jnp.abs(self.values) * rings[:, None], axis=0)
         index = jnp.argmax(within >= 0.5 * within[-1][None], axis=0)
         return jnp.maximum(self.radii[index], self.radii[1])
 
     def known_radii(self) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
-        """Return the radii and the weights of the trapezoidal rule; the first radius also
-        represents the disc within it.
+        """Return the radii and the weights of the trapezoidal rule. The first weight includes the
+        interval from 0 to the first radius.
         """
         steps = jnp.diff(self.radii)
         weights = 0.5 * (jnp.append(steps, 0.0) + jnp.insert(steps, 0, self.radii[0]))
@@ -114,10 +111,10 @@ class LaserDot(eqx.Module):
 
     **Attributes:**
 
-    - `profile`: means over rings, with their standard errors, 1/mm^2: the profile of the material
-      convolved with the profile of the beam.
-    - `center`: center of the dot, pixels: x to the right and y down, from the upper left corner of
-      the picture.
+    - `profile`: means over rings and their standard errors, 1/mm^2: the profile of the material
+      convolved with that of the beam.
+    - `center`: center of the dot in pixels from the upper left corner of the picture: x to the
+      right, y down.
     """
 
     profile: Tabulated
@@ -134,31 +131,31 @@ def measure_laser_dot(
     largest: float | None = None,
     step: float = 1.0,
 ) -> LaserDot:
-    r"""Measure the profile in a photograph of a laser dot: means over rings, with their standard
-    errors.
+    r"""Measure the profile in a photograph of a laser dot by averaging over rings.
 
-    The picture shows a flat and homogeneous sample from straight above, with a long lens, a dark
-    frame subtracted, and without specular reflection. Exitance is `pi` times radiance.
+    Photograph a flat and homogeneous sample from straight above with a long lens, without specular
+    reflection, and subtract a dark frame. The exitance is taken as `pi` times the radiance.
 
     **Arguments:**
 
     - `image`: linear radiance.
     - `mm_per_pixel`: width of a pixel on the surface, mm, positive.
-    - `power`: power that enters the material, positive, for all channels or for each: in W if the
-      image is in W/(mm^2 sr). It scales the profile, and with it the total reflectance.
-    - `center`: x and y in pixels; by default the centroid of the pixels above a fifth of the peak.
-    - `saturation`: the value at which pixels saturate; a ring with such a pixel is omitted.
-    - `largest`: radius of the last ring, mm; by default the radius of the largest circle inside the
+    - `power`: power that enters the material, positive, one number or one per channel; in W if the
+      image is in W/(mm^2 sr). The profile and its total reflectance are inversely proportional to
+      it.
+    - `center`: x and y in pixels; by default the centroid of the pixels brighter than a fifth of
+      the peak.
+    - `saturation`: the value at which pixels saturate; rings with a saturated pixel are omitted.
+    - `largest`: radius of the last ring, mm; by default that of the largest circle inside the
       picture.
     - `step`: width of a ring, pixels, at least 1.
 
-    **Returns:** a `LaserDot`. The radius of a ring is the root mean square of the radii of its
-    pixels, because the middle of a profile is flat. The standard error of a ring excludes the
-    scatter due to the slope across the ring. Rings of fewer than twelve pixels are joined to the
-    next.
+    **Returns:** a `LaserDot`. The radius of a ring is the root mean square over its pixels, because
+    a profile is flat at its center. The standard error excludes the variation due to the slope
+    across the ring. Rings of fewer than twelve pixels are merged with the next.
 
-    **Raises:** `ValueError` for pixels that are not finite, a length or power that is not positive,
-    a center outside of the picture, and if fewer than two rings are left.
+    **Raises:** `ValueError` for pixels that are not finite, for a length or power that is not
+    positive, for a center outside the picture, and if fewer than two rings remain.
     """
     pixels = np.asarray(image, np.float64)
     entering = np.broadcast_to(np.asarray(power, np.float64), pixels.shape[2:])
@@ -175,7 +172,8 @@ def measure_laser_dot(
     inside = min(x0, y0, width - x0, height - y0)
     if not inside > 0:
         raise ValueError(
-            f"center {x0:g}, {y0:g} is outside of the picture of {width} x {height} pixels"
+            f"center {x0:g}, {y0:g} is outside of the picture of {width} x {height} pixels; "
+            "give x and y in pixels"
         )
     radius = np.hypot(x - x0, y - y0)
     last = inside if largest is None else min(largest / mm_per_pixel, inside)
@@ -201,8 +199,8 @@ def measure_laser_dot(
 
 
 def _rings(radius: np.ndarray, step: float) -> list[np.ndarray]:
-    """Collect the indices of the pixels of each ring, from the center; rings too small to have a
-    scatter are joined.
+    """Collect the indices of the pixels of each ring, from the center outwards, and merge small
+    rings.
     """
     order = np.argsort(radius, kind="stable")
     edges = np.searchsorted(radius[order], np.arange(step, radius.max() + step, step))

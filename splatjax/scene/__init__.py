@@ -1,4 +1,4 @@
-"""Plain records of scenes, cameras, lights, materials and frames. No algorithms."""
+"""Records of scenes, cameras, lights, materials and frames."""
 
 from ._area_lights import (
     AbstractAreaLight as AbstractAreaLight,

@@ -1,4 +1,4 @@
-"""Area lights near a body: rectangles, disks and balls of uniform radiance."""
+"""Area lights near a body: rectangles, disks and spheres of uniform radiance."""
 
 import abc
 from typing import ClassVar
@@ -16,16 +16,16 @@ from ._environment import even_directions
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, EmitterStratum
 from ._scene import rotation_towards
 
-_GRAZING = 1e-3  # cosine to an emitter's plane, below which a mirrored ray meets it far away
-_RIM = 16  # points of the rim of a disk
+_GRAZING = 1e-3  # least cosine between a mirrored ray and the normal of an emitter
+_RIM = 16  # number of points on the rim of a disk
 _GOLDEN = (5**0.5 - 1) / 2
 
 
 class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
-    r"""A surface of uniform radiance. A glossy surface reflects the point of it that is nearest to
-    the mirrored ray.
+    r"""A light surface of uniform radiance. A glossy surface reflects its point nearest to the
+    mirrored ray.
 
-    **Source:** Karis 2013, "Real Shading in Unreal Engine 4": the representative point.
+    **Source:** Karis 2013, "Real Shading in Unreal Engine 4" (representative point).
     """
 
     center: Float[Array, "3"] = eqx.field(converter=numbers)
@@ -36,8 +36,8 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
 
     @abc.abstractmethod
     def axes(self) -> Float[Array, "axes 3"]:
-        """Compute the axes along which the samples are placed, mm: two of a flat light, which
-        emits in the direction of their cross product, or three.
+        """Compute the axes along which the samples are placed, mm. A flat light has two and emits
+        in the direction of their cross product; a sphere has three.
         """
 
     @abc.abstractmethod
@@ -50,12 +50,14 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
 
     @abc.abstractmethod
     def solid_angle(self, from_center: Float[Array, "*points 3"]) -> Float[Array, "*points"]:
-        """Compute the solid angle of the side that emits, from points in mm from the center."""
+        """Compute the solid angle of the emitting side as seen from points relative to the center,
+        mm.
+        """
 
     def normal_and_area(
         self,
     ) -> tuple[Float[Array, "3"] | None, Float[Array, ""]]:
-        """Compute the unit normal of a flat light, and its area along the normal, mm^2."""
+        """Compute the unit normal of a flat light, and the projected area of the light, mm^2."""
         axes = self.axes()
         across = jnp.cross(axes[0], axes[1])
         area = jnp.linalg.norm(across)
@@ -77,15 +79,14 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
         return self
 
     def reflected(self, points, mirrored, roughness, lobe, albedo):
-        r"""Approximate the lobe, with the solid angle `s = albedo / lobe(mirrored)`, by a Gaussian.
-
-        A light of the solid angle `w` in its middle then fills `1 - exp(-w / s)` of it: a small
-        light acts as a point, and a large one is reflected with its radiance.
+        r"""Approximate the lobe by a Gaussian with the solid angle `s = albedo / lobe(mirrored)`. A
+        light of solid angle `w` at its center then covers the fraction `1 - exp(-w / s)` of the
+        lobe: a small light acts as a point, and a large one is reflected with its radiance.
         """
         normal, _ = self.normal_and_area()
         from_center = points - jnp.broadcast_to(self.center, points.shape)
         along = -jnp.sum(from_center * mirrored, axis=-1)
-        if normal is not None:  # to the plane of the light
+        if normal is not None:  # intersect the plane of the light
             approach = jnp.maximum(-jnp.tensordot(mirrored, normal, 1), _GRAZING)
             along = jnp.tensordot(from_center, normal, 1) / approach
         hit = from_center + jnp.maximum(along, 0)[..., None] * mirrored
@@ -104,15 +105,15 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
 
 @record
 class RectangleLight(AbstractAreaLight):
-    r"""A rectangle of uniform radiance that emits to one side, such as a softbox.
+    r"""A rectangle of uniform radiance that emits from one side, such as a softbox.
 
     **Attributes:**
 
     - `center`: mm. Differentiable.
-    - `radiance`: radiance of the emitting side. From a whole sky of radiance L, a white diffuser
-      has the radiance L. Differentiable.
-    - `edges`: two edge vectors, perpendicular, mm: the rectangle extends by half of each to either
-      side of `center`. It emits in the direction of their cross product. Differentiable.
+    - `radiance`: radiance of the emitting side; a white diffuser under a whole sky of radiance L
+      has radiance L. Differentiable.
+    - `edges`: two perpendicular edge vectors, mm. The rectangle is centered at `center` and emits
+      in the direction of their cross product. Differentiable.
     - `count`: number of samples, each with a shadow map if `cast_shadows`. Both static.
     """
 
@@ -138,8 +139,8 @@ class RectangleLight(AbstractAreaLight):
         radiance: Numbers,
         **settings,
     ) -> "RectangleLight":
-        """Make a rectangle that faces a target, with a horizontal lower edge; straight above or
-        below the target, its lower edge is along x.
+        """Make a rectangle that faces a target, with a horizontal lower edge. Straight above or
+        below the target, the lower edge is along x.
 
         **Arguments:** mm; `settings` are `count` and `cast_shadows`.
         """
@@ -166,7 +167,7 @@ class RectangleLight(AbstractAreaLight):
         corners = signs.astype(self.edges.dtype) @ self.edges
         to_corners = _offsets(from_center, corners)
         lengths = _lengths(to_corners)
-        volume = jnp.tensordot(from_center, jnp.cross(*self.edges), 1)  # the same of both
+        volume = jnp.tensordot(from_center, jnp.cross(*self.edges), 1)  # equal for both triangles
 
         def triangle(*corners):
             (a, b, c), (u, v, w) = (rows[np.asarray(corners)] for rows in (lengths, to_corners))
@@ -179,11 +180,11 @@ class RectangleLight(AbstractAreaLight):
 
 @record
 class DiskLight(AbstractAreaLight):
-    r"""A disk of uniform radiance that emits to one side.
+    r"""A disk of uniform radiance that emits from one side.
 
     **Attributes:** `center`, `radiance`, `count` and `cast_shadows` as of `RectangleLight`, and
 
-    - `direction`: normal of the side that emits, any length but zero. Differentiable.
+    - `direction`: normal of the emitting side, of any nonzero length. Differentiable.
     - `radius`: mm. Differentiable.
     """
 
@@ -204,8 +205,8 @@ class DiskLight(AbstractAreaLight):
 
     def solid_angle(self, from_center: Float[Array, "*points 3"]) -> Float[Array, "*points"]:
         r"""Integrate along the rim, `(r^2 - q . x) / (s (s + h))` at `q` for a point `x` at the
-        height `h` and the distance `s` from `q`, by the trapezoidal rule. Farther than a fifth of
-        the radius from the disk, the error is at most 0.02.
+        height `h` and the distance `s` from `q`, by the trapezoidal rule. The error is at most 0.02
+        at distances above a fifth of the radius.
         """
         angle = 2 * np.pi * np.arange(_RIM) / _RIM
         around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -220,10 +221,10 @@ class DiskLight(AbstractAreaLight):
 
 @record
 class SphereLight(AbstractAreaLight):
-    r"""A ball whose surface has uniform radiance.
+    r"""A sphere whose surface has uniform radiance.
 
-    Its samples fill the ball so that from every side they have the distribution of a uniform disk.
-    The result is invalid for points inside the ball.
+    The samples fill the sphere such that, seen from any side, they are distributed as over a
+    uniform disk. The light is invalid for points inside the sphere.
 
     **Attributes:** `center`, `radiance`, `count` and `cast_shadows` as of `RectangleLight`, and
 
@@ -262,7 +263,9 @@ def _lengths(vectors: Float[Array, "*points 3"]) -> Float[Array, "*points"]:
 
 
 def _across(direction: Float[Array, "3"]) -> Float[Array, "2 3"]:
-    """Compute two unit vectors across a direction, to the right and down as seen along it."""
+    """Compute two unit vectors perpendicular to a direction: to the right and down as seen along
+    it.
+    """
     forward = direction / jnp.linalg.norm(direction)
     y, z = jnp.eye(3, dtype=forward.dtype)[1:]
     return rotation_towards(forward, jnp.where(jnp.abs(forward[1]) < 0.999, y, z))[:2]

@@ -17,10 +17,10 @@ from splatjax._records import check_values, numbers, record, require
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, DistantStratum
 from ._scene import Camera, Frame, rotation_by
 
-_CELLS = 128  # along a side of the grid of equal areas that is cut into strata; a power of two
+_CELLS = 128  # per side of the equal-area grid that is divided into strata; a power of two
 _EVEN = 0.1  # fraction of uniform importance, so that no direction is far from a sample
 _FAINT = 1e-3  # fraction of the mean radiance added in computing a stratum's mean direction
-_ROWS = 64  # height of a blurred map; a pixel is as wide as the sharpest lobe
+_ROWS = 64  # height of the blurred maps; a pixel is as wide as the sharpest lobe
 _ROUGHNESSES = np.geomspace(0.05, 1.0, 7)  # roughnesses of the blurred maps
 
 
@@ -29,34 +29,34 @@ class EnvironmentLight(AbstractExtendedLight):
     r"""Distant light from all directions, given by an image.
 
     The image is a latitude-longitude map as OpenEXR defines it, with square pixels, seen from
-    inside the sphere. Its rows run from +y at the top to -y at the bottom. Its columns show, from
-    left to right, the directions -z, +x, +z (in the middle), -x and -z.
+    inside the sphere. Its rows run from +y at the top to -y at the bottom. Its columns run from -z
+    through +x, +z (in the middle) and -x back to -z.
 
         sky = EnvironmentLight(overcast_sky(), rotation=30, strength=0.5)
 
-    The light is sampled by `count` directions. For this, the sphere is divided into parts of equal
-    importance: 90% by their light (radiance times solid angle), and 10% by their solid angle alone,
-    so that no direction is far from a sample. Each sample carries the light of its whole part,
-    comes from the mean direction of that light, and has its own shadow map. Highlights are not
-    sampled: glossy surfaces reflect the image, blurred by the lobe.
+    The light is sampled by `count` directions. The sphere is divided into parts of equal
+    importance, weighted 90% by light (radiance times solid angle) and 10% by solid angle alone, so
+    that no direction is far from a sample. Each sample carries the light of its part, comes from
+    the mean direction of that light, and has its own shadow map. Highlights are not sampled; glossy
+    surfaces reflect the image, blurred by the lobe.
 
     **Attributes:**
 
     - `image`: radiance, linear; twice as wide as high, gray or in color. Differentiable; the
       boundaries of the parts are constants.
     - `rotation`: degrees about `up`; a positive angle turns +z towards +x. Differentiable.
-    - `strength`: a factor on each channel. Differentiable.
-    - `up`: the direction of the image's upper edge: (0, 0, 1) for a world whose z is up; the middle
-      of the image is then -y. Any length but zero. Differentiable.
-    - `directions`: world directions of the samples, any length but zero; `None` to choose the
-      samples by the image. With given directions, the visibility that `splatjax.transfer` computes
-      stays valid for every image and rotation. The light of every pixel is distributed to the
-      directions near it.
-    - `count`: number of samples that are chosen by the image. Static.
-    - `cast_shadows`: whether it has shadow maps. Static.
+    - `strength`: factor of each channel. Differentiable.
+    - `up`: the direction of the image's upper edge, of any nonzero length. With (0, 0, 1), for a
+      world with z up, the middle of the image is -y. Differentiable.
+    - `directions`: world directions of the samples, of any nonzero length, to which the light of
+      nearby pixels is distributed; or `None` to choose the samples by the image. With given
+      directions, the visibility that `splatjax.transfer` computes is valid for every image and
+      rotation.
+    - `count`: number of samples if the image chooses them. Static.
+    - `cast_shadows`: whether the samples have shadow maps. Static.
 
-    **Raises:** `ValueError` for an image that is not twice as wide as high, or has integers, or
-    negative or infinite radiance.
+    **Raises:** `ValueError` for an image that is not twice as wide as high, has an integer dtype,
+    or contains negative or infinite radiance.
     """
 
     image: Float[Array, "height width #channels"] = eqx.field(
@@ -84,12 +84,12 @@ class EnvironmentLight(AbstractExtendedLight):
         return self.image * self.strength[None, None]
 
     def to_world(self) -> Float[Array, "3 3"]:
-        """Compute the rotation from the directions of the image to directions in the world: about
-        +y, then the shortest rotation from +y to `up`.
+        """Compute the rotation from image to world directions: a rotation about +y, then the
+        shortest rotation from +y to `up`.
         """
         turn = rotation_by(jnp.deg2rad(self.rotation) * jnp.eye(3, dtype=self.up.dtype)[1])
         x, y, z = jnp.unstack(self.up / jnp.linalg.norm(self.up))
-        is_down = (y < 0) & (x * x + z * z < 1e-12)  # half a turn about x
+        is_down = (y < 0) & (x * x + z * z < 1e-12)  # rotate by half a turn about x
         x, z = jnp.where(is_down, 0.0, x), jnp.where(is_down, 1e-6, z)
         # 1 / (1 + y), without cancellation.
         lean = jnp.where(y < 0, 1 - y, 1.0) / jnp.where(y < 0, x * x + z * z, 1 + y)
@@ -131,7 +131,7 @@ class EnvironmentLight(AbstractExtendedLight):
         """
         samples = self.directions / jnp.linalg.norm(self.directions, axis=1, keepdims=True)
         samples = samples @ self.to_world()
-        concentration = len(samples) / jnp.pi  # over the squared angle
+        concentration = len(samples) / jnp.pi  # of a Gaussian in the angle
 
         def of_row(row):
             towards, moments = row
@@ -140,7 +140,7 @@ class EnvironmentLight(AbstractExtendedLight):
         return jnp.sum(jax.lax.map(of_row, (directions, moments)), axis=0)
 
     def _stratify(self, moments: Float[Array, "height width sums"]) -> Float[Array, "strata sums"]:
-        """Sum the moments over strata, which divide the sphere along a Hilbert curve."""
+        """Sum the moments over strata, which are segments of a Hilbert curve over the sphere."""
         # Sum over cells of equal area, in the order of the curve.
         height = len(moments)
         along = np.arange(2 * height) * _CELLS // (2 * height)
@@ -150,7 +150,7 @@ class EnvironmentLight(AbstractExtendedLight):
         moments = moments.reshape(len(order), -1)
         cells = jnp.zeros((_CELLS**2, moments.shape[1]), moments.dtype).at[order].add(moments)
 
-        # Divide the curve. No cell counts more than one stratum, or the next stratum would be
+        # Divide the curve. A cell counts at most one stratum; otherwise the next one would be
         # empty.
         importance, even = jax.lax.stop_gradient(cells[:, -2:]).T
         importance = (1 - _EVEN) * importance + _EVEN * even
@@ -178,11 +178,11 @@ class PrefilteredEnvironment(AbstractHighlight):
 
     **Attributes:**
 
-    - `maps`: latitude-longitude, the sharpest first; one more pixel at every edge repeats the pixel
-      beyond it.
-    - `rotation`: from the directions of the maps to those of the world.
+    - `maps`: latitude-longitude maps, the sharpest first, padded at every edge by the adjacent
+      pixel of the sphere.
+    - `rotation`: rotates directions of the maps to directions in the world.
 
-    **Source:** Karis 2013, "Real Shading in Unreal Engine 4": the split sum.
+    **Source:** Karis 2013, "Real Shading in Unreal Engine 4" (split sum).
     """
 
     maps: Float[Array, "maps rows columns channels"]
@@ -195,7 +195,7 @@ class PrefilteredEnvironment(AbstractHighlight):
         self, directions: Float[Array, "*points 3"], roughness: Float[Array, "..."]
     ) -> Float[Array, "*points channels"]:
         """Interpolate in the logarithm of the roughness and between pixels. At the poles the
-        derivative in the direction is set to 0.
+        derivative with respect to the direction is set to 0.
         """
         x, y, z = jnp.unstack(directions @ self.rotation, axis=-1)
         apart = x * x + z * z > 1e-12
@@ -212,7 +212,7 @@ class PrefilteredEnvironment(AbstractHighlight):
 
 
 def even_directions(count: int) -> Float[np.ndarray, "count 3"]:
-    """Spread directions evenly over the sphere, along a Fibonacci spiral."""
+    """Compute directions evenly spread over the sphere along a Fibonacci spiral."""
     i = np.arange(count) + 0.5
     height, angle = 1 - 2 * i / count, np.pi * (5**0.5 - 1) * i
     across = np.sqrt(1 - height * height)
@@ -230,14 +230,14 @@ def pixel_directions(
     across, up = jnp.cos(latitude)[:, None], jnp.sin(latitude)[:, None]
     sine, cosine = jnp.sin(longitude)[None], jnp.cos(longitude)[None]
     directions = jnp.broadcast_arrays(across * sine, up, across * cosine)
-    # A strip of the sphere has the area of its height: 2 sin(a / 2) cos(latitude).
+    # The area of a strip of the sphere is proportional to its height, 2 sin(a / 2) cos(latitude).
     solid_angles = across * (2 * math.sin(0.5 * math.pi / height) * math.pi / height)
     return jnp.stack(directions, axis=-1), jnp.broadcast_to(solid_angles, (height, 2 * height))
 
 
 @functools.cache
 def _hilbert_curve(side: int) -> np.ndarray:
-    """Number the cells of a square along a Hilbert curve; the side is a power of two."""
+    """Number the cells of a square along a Hilbert curve. `side` is a power of two."""
     if side == 1:
         return np.zeros((1, 1), int)
     part, count = _hilbert_curve(side // 2), side * side // 4
@@ -248,10 +248,11 @@ def _hilbert_curve(side: int) -> np.ndarray:
 def prefilter(
     radiance: Float[Array, "height width channels"],
 ) -> Float[Array, "maps _ _ channels"]:
-    r"""Prefilter an environment by the specular lobe along the normal, for several roughnesses.
+    r"""Prefilter an environment by the specular lobe at normal incidence, for several roughnesses.
 
-    The lobe at the angle `2 a` from the mirrored direction is `exp(-tan^2 a / m^2) cos 2a / cos^6
-    a`, divided by its integral. In longitude it is a circular convolution.
+    The lobe at the angle `2 a` from the mirrored direction is
+    `exp(-tan^2 a / m^2) cos 2a / cos^6 a`, divided by its integral. In longitude the filter is a
+    circular convolution.
     """
     dtype, size = radiance.dtype, (_ROWS, 6 * _ROWS, radiance.shape[-1])
     # Three copies side by side, because the map is periodic.
@@ -272,13 +273,13 @@ def prefilter(
         mass = kernel[:, :, 0] @ solid_angles[:, 0]
         return jnp.fft.irfft(blurred, axis=1) / mass[:, None, None]
 
-    # The barrier prevents constant folding: the compiler would otherwise compute all kernels.
+    # The barrier prevents constant folding of all kernels by the compiler.
     maps = jax.lax.map(blur, jax.lax.optimization_barrier(jnp.asarray(_ROUGHNESSES, dtype)))
     return _padded(maps)
 
 
 def _padded(maps: Float[Array, "maps rows columns channels"]) -> Float[Array, "maps _ _ channels"]:
-    """Pad the map by its neighbors on the sphere."""
+    """Pad the maps by the adjacent pixels on the sphere."""
     half = maps.shape[2] // 2
     top, bottom = (jnp.roll(maps[:, row], half, axis=2) for row in (slice(1), slice(-1, None)))
     maps = jnp.concatenate([top, maps, bottom], axis=1)

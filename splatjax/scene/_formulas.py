@@ -1,5 +1,5 @@
-"""Environments by formula: a sum of spherical harmonics, in which a picture is linear; and images
-of a studio, an overcast sky, and a sky with the sun.
+"""Analytic environments: sums of spherical harmonics, and images of a studio, an overcast sky, and
+a sky with the sun.
 """
 
 import math
@@ -23,7 +23,8 @@ from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSamp
 from ._scene import rotation_towards
 
 _ROWS = 64  # height of the map used for highlights
-# Softboxes: azimuth and elevation in degrees, half of width and height over distance, radiance.
+# Softboxes: azimuth and elevation in degrees, half width and half height divided by distance, and
+# radiance.
 _SOFTBOXES = (
     (-30.0, 35.0, 0.5, 0.6, (3.9, 3.65, 3.3)),
     (75.0, 5.0, 0.6, 0.9, (0.33, 0.38, 0.48)),
@@ -37,17 +38,18 @@ _CONCENTRATION = 1500.0  # concentration of the sun's light, spread over about 3
 class HarmonicLight(AbstractExtendedLight):
     r"""Distant light from all directions, as a sum of spherical harmonics.
 
-    It is sampled by `count` even directions (`even_directions`), whose visibility is valid for all
+    The light is sampled by `count` evenly spread directions, whose visibility is valid for all
     coefficients (`splatjax.transfer`, `splatjax.relighting_basis`). A picture is linear in the
-    coefficients: its highlight and its layer `shadow` use the visibility of uniform light.
+    coefficients, because the highlight and the layer `shadow` use the visibility of uniform light.
 
     **Attributes:**
 
-    - `coefficients`: radiance, of `spherical_harmonics` in world space. The sum may be negative in
-      some directions, for example for a small sun with few harmonics. Differentiable.
-    - `count`, `cast_shadows`: static.
+    - `coefficients`: coefficients of the radiance in `spherical_harmonics`, in world space. The
+      radiance may be negative in some directions, for example for a small sun with few harmonics.
+      Differentiable.
+    - `count`, `cast_shadows`: as of `EnvironmentLight`.
 
-    **Raises:** `ValueError` for another number of coefficients than 1, 4, 9, 16, 25, ...
+    **Raises:** `ValueError` unless the number of coefficients is a square: 1, 4, 9, 16, 25, ...
     """
 
     coefficients: Float[Array, "harmonics channels"] = eqx.field(converter=numbers)
@@ -62,8 +64,8 @@ class HarmonicLight(AbstractExtendedLight):
 
     @classmethod
     def of(cls, environment: EnvironmentLight, order: int = 4, **settings) -> "HarmonicLight":
-        """Project an environment, in its rotation, onto the harmonics up to an order.
-        Differentiable in every field of the environment.
+        """Project a rotated environment onto the harmonics up to an order. Differentiable in every
+        field of the environment.
 
         **Arguments:** `settings` are `count` and `cast_shadows`.
         """
@@ -73,7 +75,7 @@ class HarmonicLight(AbstractExtendedLight):
         return cls(jnp.einsum("hwb,hwc,hw->bc", harmonics, radiance, solid_angles), **settings)
 
     def radiance(self, directions: Float[Array, "*points 3"]) -> Float[Array, "*points channels"]:
-        """Compute the radiance from world directions, unit vectors."""
+        """Compute the radiance from world directions, which are unit vectors."""
         order = math.isqrt(len(self.coefficients)) - 1
         return spherical_harmonics(directions, order) @ self.coefficients
 
@@ -92,7 +94,9 @@ class HarmonicLight(AbstractExtendedLight):
 
 
 class HarmonicStratum(DistantStratum):
-    """A direction of a `HarmonicLight`, of either sign; all have the same weight."""
+    """A direction of a `HarmonicLight`, with radiance of either sign. All directions have the same
+    weight.
+    """
 
     def weight(self, irradiance: Float[Array, "*points channels"]) -> Float[Array, "*points"]:
         return jnp.ones_like(irradiance[..., 0])
@@ -103,17 +107,17 @@ def spherical_harmonics(
 ) -> Float[Array, "*points harmonics"]:
     r"""Evaluate the real spherical harmonics up to an order.
 
-    They are orthonormal over the sphere; the index of `Y_lm` is `l (l + 1) + m`. The pole is +z,
-    and the first band is `sqrt(3 / (4 pi)) (y, z, x)`.
+    The harmonics are orthonormal over the sphere; the index of `Y_lm` is `l (l + 1) + m`. The pole
+    is +z, and the first band is `sqrt(3 / (4 pi)) (y, z, x)`.
 
     **Arguments:**
 
-    - `directions`: unit. Differentiable.
+    - `directions`: unit vectors. Differentiable.
 
     **Returns:** `(order + 1)^2` values.
 
-    **Source:** Sloan 2008, "Stupid Spherical Harmonics (SH) Tricks", without the sign of Condon and
-    Shortley.
+    **Source:** Sloan 2008, "Stupid Spherical Harmonics (SH) Tricks", without the Condon-Shortley
+    phase.
     """
     x, y, z = jnp.unstack(directions, axis=-1)
     rows: list = [None] * (order + 1) ** 2
@@ -136,14 +140,14 @@ def spherical_harmonics(
 
 @jit_unless_traced
 def studio(height: int = 64) -> Float[Array, "height width 3"]:
-    """Make a dark studio with a large softbox in front on the side of -x, a weak one on the side of
-    +x, and a strip behind.
+    """Make a dark studio with a large softbox in front towards -x, a weak one towards +x, and a
+    strip behind.
 
     **Arguments:**
 
     - `height`: height of the image, which is twice as wide.
 
-    **Returns:** radiance; the irradiance of a surface that faces the large softbox is about pi.
+    **Returns:** radiance. The irradiance on a surface that faces the large softbox is about pi.
     """
     directions, image = pixel_directions(height)[0], jnp.full(3, 0.04)[None, None]
     for azimuth, elevation, half_width, half_height, radiance in _SOFTBOXES:
@@ -157,10 +161,10 @@ def studio(height: int = 64) -> Float[Array, "height width 3"]:
 
 @jit_unless_traced
 def overcast_sky(height: int = 64) -> Float[Array, "height width 3"]:
-    """Make the overcast sky of the CIE, `L = L_zenith (1 + 2 sin(elevation)) / 3`, over a ground
-    that reflects a fifth.
+    """Make the CIE overcast sky, `L = L_zenith (1 + 2 sin(elevation)) / 3`, over a ground with
+    albedo 0.2.
 
-    **Returns:** radiance; the irradiance of a horizontal surface is pi.
+    **Returns:** radiance. The irradiance on a horizontal surface is pi.
 
     **Source:** Moon and Spencer 1942, "Illumination from a non-uniform sky".
     """
@@ -175,10 +179,10 @@ def sun_and_sky(
 
     **Arguments:**
 
-    - `elevation`, `azimuth`: direction of the sun, degrees; azimuth 0 is +z, 90 is +x. A sun below
-      the horizon gives no light. Differentiable.
+    - `elevation`, `azimuth`: direction of the sun, degrees; azimuth 0 is +z and 90 is +x. A sun
+      below the horizon emits no light. Differentiable.
 
-    **Returns:** radiance; a surface that faces the sun receives about 2.2 from it.
+    **Returns:** radiance. The sun's irradiance on a surface that faces it is about 2.2.
     """
     directions, solid_angles = pixel_directions(height)
     zenith, horizon, sun = (jnp.asarray(rgb)[None, None] for rgb in (_ZENITH, _HORIZON, _SUN))
@@ -193,7 +197,7 @@ def sun_and_sky(
 
 
 def _towards(azimuth: Numbers, elevation: Numbers) -> Float[Array, "3"]:
-    """Compute the direction of a point of the sky."""
+    """Compute the unit vector towards an azimuth and elevation in degrees."""
     turn, rise = (jnp.deg2rad(as_floats(degrees)) for degrees in (azimuth, elevation))
     across = jnp.cos(rise)
     return jnp.stack([jnp.sin(turn) * across, jnp.sin(rise), jnp.cos(turn) * across])

@@ -1,4 +1,4 @@
-"""Samples of lights of one kind, in one array for each field."""
+"""Samples of lights of one kind, with one array per field."""
 
 import equinox as eqx
 import jax
@@ -9,8 +9,8 @@ from ._lights import AbstractHighlight, AbstractLight, AbstractLightSample
 
 
 class StackedLights(eqx.Module):
-    """Samples of lights of one kind, their leaves stacked, and for each the index of its light in
-    the scene's tuple; also the highlight of each light, if it has one.
+    """Stacked samples of lights of one kind, with the index of each sample's light in the scene,
+    and the highlight of each light that has one.
     """
 
     lights: AbstractLightSample
@@ -42,9 +42,9 @@ class StackedLights(eqx.Module):
 def lights_by_kind(
     lights: tuple[AbstractLight, ...],
 ) -> list[list[tuple[int, AbstractLightSample]]]:
-    """List the samples of each kind of lights, each with the index of its light. Lights with one
-    highlight for all samples are listed separately. Kinds are sorted, so that scenes whose lights
-    differ only in order share a program.
+    """List the samples of each kind of light with the indices of their lights. A light with a
+    common highlight is listed separately. Kinds are sorted, so that scenes whose lights differ only
+    in order share a program.
     """
     kinds: dict[object, list[tuple[int, AbstractLightSample]]] = {}
     for index, light in enumerate(lights):
@@ -55,7 +55,7 @@ def lights_by_kind(
 
 
 def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
-    """Stack samples of equal kind, so that one loop computes any number of them."""
+    """Stack samples of the same kind, so that one loop computes any number of them."""
     groups = []
     for members in lights_by_kind(lights):
         indices, samples = zip(*members, strict=True)

@@ -1,5 +1,5 @@
-"""Lights. Directions point in the direction in which the light travels; `wi` points from the
-surface towards the light.
+"""Lights. A `direction` is the direction in which light travels; `wi` points from the surface to
+the light.
 """
 
 import abc
@@ -18,7 +18,7 @@ from splatjax._smooth import smooth_step
 from splatjax.gaussians import gaussian
 
 _TOUCHING = 1e-6  # mm
-# Requirements of fields of lights: the description and the check. All other fields must be finite.
+# Requirements on fields of lights: a description and a check. All other fields must be finite.
 _EXPECTED = {
     "direction": ("the way light travels, not zero", np.any),
     "variance": ("positive (mm^2)", lambda x: x > 0),
@@ -31,7 +31,7 @@ _EXPECTED = {
 
 
 class AbstractHighlight(eqx.Module):
-    """The reflection of an extended light by glossy surfaces, in place of its samples' lobes."""
+    """The reflection of an extended light by glossy surfaces, instead of its samples' lobes."""
 
     @abc.abstractmethod
     def reflected(
@@ -47,18 +47,18 @@ class AbstractHighlight(eqx.Module):
         **Arguments:**
 
         - `points`: mm.
-        - `mirrored`: the unit direction towards the eye, mirrored by the surface.
-        - `lobe`: the radiance towards the eye per irradiance of a surface that faces `wi`.
+        - `mirrored`: the mirrored direction of the eye, a unit vector.
+        - `lobe`: computes the radiance towards the eye per irradiance on a surface that faces `wi`.
         - `albedo`: the lobe's integral over all `wi`.
         """
 
 
 class AbstractLight(eqx.Module):
-    """A light: a distribution of samples, which are points or directions.
+    """A light, represented by samples, which are points or directions.
 
     **Attributes:** (of the class)
 
-    - `strength_field`: the name of the field with the power of each channel.
+    - `strength_field`: the name of the field that holds the power of each channel.
     """
 
     strength_field: ClassVar[str] = ""
@@ -84,15 +84,13 @@ class AbstractLight(eqx.Module):
 
     @abc.abstractmethod
     def samples(self) -> tuple["AbstractLightSample", ...]:
-        """Return the points and directions from which the light comes.
-
-        The light of each sample enters the surface with its own shadow. The specular lobes, or the
-        common highlight, use the mean visibility of the samples, so that passes 2 and 3 blend one
-        row per light.
+        """Return the points and directions from which the light comes. Each sample has its own
+        shadow in the light that enters the surface. The specular lobes, or the common highlight,
+        use the mean visibility of the samples, so that passes 2 and 3 blend only one row per light.
         """
 
     def highlight(self) -> AbstractHighlight | None:
-        """Prepare the highlight once for all points; `None` if it is the sum of the lobes of all
+        """Prepare the highlight for all points; `None` if it is the sum of the lobes of the
         samples.
         """
         return None
@@ -104,7 +102,7 @@ class AbstractLightSample(AbstractLight):
     @property
     @abc.abstractmethod
     def cast_shadows(self) -> bool:
-        """Whether it has a shadow map: a static field of each class, with a default."""
+        """Whether the sample has a shadow map; a static field of each class, with a default."""
 
     def samples(self) -> tuple["AbstractLightSample", ...]:
         """Return the light itself."""
@@ -114,22 +112,22 @@ class AbstractLightSample(AbstractLight):
     def incidence(
         self, points: Float[Array, "*points 3"]
     ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        """Compute, at points in mm, the unit direction `wi` towards the light and the irradiance
-        on a surface that faces it.
+        """Compute at points (mm) the unit direction `wi` towards the light, and the irradiance on a
+        surface that faces the light.
         """
 
     def weight(self, irradiance: Float[Array, "*points channels"]) -> Float[Array, "*points"]:
-        """Compute the weight of the sample in the mean visibility of its light: its irradiance."""
+        """Compute the weight of the sample in its light's mean visibility: the irradiance."""
         return jnp.sum(abs(irradiance), axis=-1)
 
 
 class AbstractExtendedLight(AbstractLight):
-    """A light that is represented by many samples, with one highlight for all.
+    """A light with many samples and one highlight.
 
     **Attributes:** (static)
 
-    - `count`: number of samples, each with a shadow map.
-    - `cast_shadows`.
+    - `count`: number of samples.
+    - `cast_shadows`: whether each sample has a shadow map.
     """
 
     count: int = eqx.field(static=True, default=64, kw_only=True)
@@ -145,8 +143,8 @@ class AbstractExtendedLight(AbstractLight):
 
 
 def _rows(leaf: Float[Array, "rows ..."]) -> Sequence[Float[Array, "..."]]:
-    """Return the rows of an array. Outside `jit` nothing is compiled, where each row would be a
-    kernel of its own.
+    """Return the rows of an array. Outside `jit` they are split on the host, because slicing would
+    compile a kernel for each row.
     """
     if is_traced(leaf):
         return jnp.unstack(leaf)
@@ -165,10 +163,10 @@ class DirectionalLight(AbstractLightSample):
 
     **Attributes:**
 
-    - `direction`: the way the light travels, any length but zero. Differentiable.
+    - `direction`: the direction in which light travels, of any nonzero length. Differentiable.
     - `irradiance`: irradiance on a surface that faces the light; pi on a white diffuser gives
       radiance 1. Differentiable.
-    - `cast_shadows`: whether it has a shadow map. Static.
+    - `cast_shadows`: whether the light has a shadow map. Static.
     """
 
     direction: Float[Array, "3"] = eqx.field(converter=numbers)
@@ -205,15 +203,15 @@ class AbstractPointSample(AbstractLightSample):
 class PointLight(AbstractPointSample):
     r"""Light from a point, with inverse-square falloff.
 
-    A surface point within 1e-6 mm of the light receives no light: the limit diverges, so value and
-    gradient are set to zero there.
+    A surface point within 1e-6 mm of the light receives no light: the irradiance diverges there, so
+    value and gradient are set to 0.
 
     **Attributes:**
 
     - `position`: mm. Differentiable.
     - `intensity`: power per solid angle; the irradiance is `intensity cos / d^2`, d in mm.
       Differentiable.
-    - `cast_shadows`: whether it has a shadow map. Static.
+    - `cast_shadows`: whether the light has a shadow map. Static.
     """
 
     position: Float[Array, "3"] = eqx.field(converter=numbers)
@@ -223,21 +221,21 @@ class PointLight(AbstractPointSample):
 
 @record
 class SpotLight(AbstractPointSample):
-    r"""A point light whose light is limited to a cone.
+    r"""A point light restricted to a cone.
 
-    From the inner to the outer angle the intensity falls to 0, by a smooth step in the cosine of
-    the angle to the axis (as `SpotLight` of pbrt).
+    The intensity falls to 0 from the inner to the outer angle, by a smooth step in the cosine of
+    the angle to the axis (as in pbrt's `SpotLight`).
 
     **Attributes:**
 
     - `position`: mm. Differentiable.
-    - `direction`: direction of the axis, the way the light travels, any length but zero.
+    - `direction`: direction in which light travels along the axis, of any nonzero length.
       Differentiable.
     - `intensity`: power per solid angle inside the inner cone. Differentiable.
     - `inner_angle`, `outer_angle`: degrees from the axis, at most 180. Differentiable.
-    - `cast_shadows`: whether it has a shadow map. Static.
+    - `cast_shadows`: whether the light has a shadow map. Static.
 
-    **Raises:** `ValueError` unless the outer angle is larger than the inner one.
+    **Raises:** `ValueError` unless the outer angle is larger than the inner angle.
     """
 
     position: Float[Array, "3"] = eqx.field(converter=numbers)
@@ -267,15 +265,15 @@ class SpotLight(AbstractPointSample):
 
 
 class DistantStratum(DirectionalLight):
-    """A part of an environment, as parallel light."""
+    """A part of an environment, treated as parallel light."""
 
 
 class EmitterStratum(PointLight):
-    """A part of an area light, as a point.
+    """A part of an area light, treated as a point.
 
     **Attributes:**
 
-    - `normal`: unit; the intensity falls off with the cosine to it. `None`: even on all sides.
+    - `normal`: unit vector; the intensity is proportional to the cosine to it. `None`: isotropic.
     """
 
     normal: Float[Array, "3"] | None = None
@@ -291,14 +289,13 @@ class EmitterStratum(PointLight):
 
 @record
 class GaussianBeam(AbstractLightSample):
-    r"""A laser: parallel light whose power falls off as a Gaussian with the distance from its axis.
-    It casts no shadows.
+    r"""A laser beam: parallel light with a Gaussian cross section. It casts no shadows.
 
     **Attributes:**
 
     - `origin`: a point on the axis, mm. Differentiable.
-    - `direction`: the way the light travels, any length but zero. Differentiable.
-    - `power`: power of the whole beam. Differentiable.
+    - `direction`: the direction in which light travels, of any nonzero length. Differentiable.
+    - `power`: total power of the beam. Differentiable.
     - `variance`: variance of the Gaussian per axis, mm^2. Differentiable.
     """
 

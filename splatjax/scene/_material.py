@@ -1,4 +1,4 @@
-"""Translucent materials: their Gaussians, their surface, and the angles of their light."""
+"""Translucent materials: the Gaussians, the surface, and the angular law."""
 
 import dataclasses
 from typing import Any
@@ -21,37 +21,37 @@ from splatjax.fitting import (
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import ANGULAR_POWERS, AngularLaw, Medium, SingleScattering
 
-_NARROW = 1e-6  # mm^2: far below any splat, so that the layer is unresolved
+_NARROW = 1e-6  # mm^2: far narrower than any splat, so that the layer is unresolved
 
 
 @record
 class Material(eqx.Module):
-    r"""A translucent material: the diffusion below the surface, and the reflection at the surface.
+    r"""A translucent material: diffusion below the surface and reflection at the surface.
 
         material = load_material("marble")
         material = Material.of_medium(Medium([0.02, 0.006, 0.015], [1.1, 1.3, 1.5], eta=1.6))
         material = Material(fit_gaussians(Dipole(load_medium("marble"))).gaussians, eta=1.5)
 
-    **Attributes:** (differentiable, but for `wavelengths`)
+    **Attributes:** (differentiable, except `wavelengths`)
 
     - `gaussians`: the diffusion profile. The sum of its weights is the diffuse reflectance.
-    - `eta`: index of refraction relative to air, positive. It determines how much light the surface
-      reflects and how much enters, at any strength of the lobe. With 1 the surface reflects
-      nothing.
+    - `eta`: index of refraction relative to air, positive. It determines how much light enters,
+      whatever the strength of the lobe. With 1 the surface reflects nothing.
     - `specular`: strength of the specular lobe (rho_s), at least 0. With 1 the lobe reflects
       exactly the light that does not enter.
-    - `roughness`: root mean square slope of the surface (m), at least 0; rendered as 0.05 to 1.
-    - `single_scattering`: light that scatters once, as a separate term; the Gaussians then
-      represent the rest. `None`: the Gaussians represent all light.
-    - `angles`: how the light of the Gaussians depends on the angles of entry and exit. `None`: no
-      dependence.
-    - `medium`: coefficients, which `ShapeDiffuser` uses instead of Gaussians, single scattering and
-      angles; or `None`.
-    - `wavelengths`: of the channels, nm, ascending; `None` for channels such as red, green and
-      blue. They determine the colors of pictures (`io.picture_to_rgb`), and not the light.
+    - `roughness`: root mean square slope of the surface (m), at least 0; clamped to [0.05, 1] in
+      rendering.
+    - `single_scattering`: light that is scattered once, as a separate term; the Gaussians then
+      represent the remaining light. `None`: the Gaussians represent all light.
+    - `angles`: the dependence of the light of the Gaussians on the angles of entry and exit; `None`
+      for none.
+    - `medium`: optical coefficients, which `ShapeDiffuser` uses instead of Gaussians, single
+      scattering and angles; or `None`.
+    - `wavelengths`: the wavelength of each channel, nm, ascending; `None` for channels such as red,
+      green and blue. They only affect the colors of pictures (`io.picture_to_rgb`).
 
     **Raises:** `ValueError` for a value out of range, for wavelengths that do not ascend, and if
-    `single_scattering`, `angles` or `wavelengths` has another number of channels than the
+    `single_scattering`, `angles` or `wavelengths` does not have the number of channels of the
     Gaussians.
     """
 
@@ -95,15 +95,15 @@ class Material(eqx.Module):
         **surface: Any,
     ) -> "Material":
         """Fit a material to optical coefficients, as `splatjax fit` does. Differentiable in the
-        medium. The fit has the precision of the medium: for the numbers of the command, create the
-        medium in float64 (`jax.enable_x64`).
+        medium. The fit has the precision of the medium; to reproduce the command's numbers, create
+        the medium in float64 (`jax.enable_x64`).
 
         **Arguments:**
 
         - `count`: number of Gaussians.
-        - `model`: the model of the profile: by default light transport with isotropic scattering;
-          `TransportModel(g=0.8)` for forward scattering.
-        - `surface`: `specular`, `roughness`, and `eta`, by default the medium's.
+        - `model`: the model of the profile, by default light transport with isotropic scattering;
+          use `TransportModel(g=0.8)` for forward scattering.
+        - `surface`: `specular`, `roughness` and `eta`; the default `eta` is that of the medium.
 
         **Raises:** `ValueError` as `fit_gaussians` does.
         """
@@ -121,7 +121,7 @@ class Material(eqx.Module):
         return self.gaussians.channels
 
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Compute the diffuse reflectance of a flat surface for light along its normal."""
+        """Compute the diffuse reflectance of a flat surface for light along the normal."""
         return self.gaussians.total_reflectance() + self.single_scattering_albedo()
 
     def single_scattering_albedo(self) -> Float[Array, " channels"]:
@@ -131,18 +131,20 @@ class Material(eqx.Module):
         return self.single_scattering.total_reflectance()
 
     def angular_law(self) -> AngularLaw:
-        """Return `angles`, or the law of value 1 at every angle, with the powers of `HalfSpace`."""
+        """Return `angles` or, if it is `None`, the constant law 1 with as many powers as that of
+        `HalfSpace`.
+        """
         if self.angles is not None:
             return self.angles
         constant = np.eye(ANGULAR_POWERS, 1, dtype=self.gaussians.weights.dtype)
         return AngularLaw(jax.device_put(constant.repeat(self.channels, 1)))
 
     def diffuse_fraction(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
-        """Compute the factor on the Gaussians for light that enters at the cosine `mu_i`; 1 along
-        the normal.
+        """Compute the factor of the Gaussians for light that enters at the cosine `mu_i`. It is 1
+        along the normal.
 
-        Grazing light leaves after a single scattering more often than light along the normal. If
-        single scattering and the Gaussians together exceed 1, the Gaussians get the rest.
+        Grazing light leaves after one scattering event more often than light along the normal. If
+        single scattering and the Gaussians together exceeded 1, the Gaussians are reduced.
         """
         factor = self.angular_law()(mu_i)
         if self.single_scattering is None:
@@ -153,13 +155,17 @@ class Material(eqx.Module):
         return jnp.where(is_over, remaining / jnp.where(is_over, total, 1.0), factor)
 
     def surface_of(self, gaussians: SumOfGaussians, angles: AngularLaw | None = None) -> "Material":
-        """Return a material with other Gaussians and this surface, without single scattering."""
+        """Return a material with other Gaussians and the surface of this one, without single
+        scattering.
+        """
         return dataclasses.replace(
             self, gaussians=gaussians, angles=angles, single_scattering=None, medium=None
         )
 
     def opaque(self) -> "Material":
-        """Replace scattering by one Gaussian of the total reflectance, narrower than any splat."""
+        """Replace scattering by one Gaussian with the total reflectance, narrower than any
+        splat.
+        """
         variances = jnp.full_like(self.gaussians.variances, _NARROW, shape=(1,))
         return self.surface_of(SumOfGaussians(variances, self.total_reflectance()[None]))
 

@@ -28,29 +28,29 @@ from splatjax._records import (
 from ._lights import AbstractLight
 from ._material import Material
 
-_PARALLEL = 1e-6  # sine of an angle that single precision does not resolve
-_FARTHEST = 1e15  # single precision can square such a number, and multiply the square once more
+_PARALLEL = 1e-6  # sine of an angle below the resolution of float32
+_FARTHEST = 1e15  # float32 can represent the square, and larger products with it
 
 
 @record
 class Camera(eqx.Module):
     r"""A pinhole camera; `Camera.look_at` places one by position and target.
 
-    Pixel centers are at half integers; the origin of the picture is its top left corner. In camera
-    coordinates x points right, y down, and z into the picture.
+    Pixel centers are at half integers, and the origin of the picture is its top left corner. In
+    camera coordinates x points right, y points down, and z points into the picture.
 
     **Attributes:**
 
     - `position`: the pinhole, mm. Differentiable.
-    - `rotation`: world to camera; its rows are the camera's right, down and forward axes,
-      orthonormal. Differentiable.
-    - `focal_length`: in heights of the picture: `1 / (2 tan(fov / 2))` for a vertical field of view
-      `fov`. Differentiable.
+    - `rotation`: rotation from world to camera; its rows are the right, down and forward axes of
+      the camera, orthonormal. Differentiable.
+    - `focal_length`: focal length divided by the height of the picture: `1 / (2 tan(fov / 2))` for
+      a vertical field of view `fov`. Differentiable.
     - `width`, `height`: size of the picture, pixels. Static.
-    - `near`: splats with a center nearer than this along the forward axis are not rendered; mm.
-      Static.
-    - `principal_point`: where the forward axis meets the picture: column divided by `width`, and
-      row divided by `height`. `None`: the middle, `[0.5, 0.5]`. Differentiable.
+    - `near`: least distance of splat centers along the forward axis, mm; nearer splats are not
+      rendered. Static.
+    - `principal_point`: where the forward axis meets the picture: column divided by `width` and row
+      divided by `height`. `None` is the middle, `[0.5, 0.5]`. Differentiable.
 
     **Raises:** `ValueError` for a picture without pixels, and for numbers that are not finite.
     """
@@ -69,7 +69,7 @@ class Camera(eqx.Module):
 
     @property
     def principal_pixel(self) -> tuple[Any, Any]:
-        """Return column and row, in pixels, where the forward axis meets the picture."""
+        """Return the column and row, in pixels, where the forward axis meets the picture."""
         x, y = (0.5, 0.5) if self.principal_point is None else self.principal_point
         return x * self.width, y * self.height
 
@@ -92,15 +92,15 @@ class Camera(eqx.Module):
         **Arguments:**
 
         - `eye`, `target`: mm. `target` appears in the middle of the picture.
-        - `up`: a direction that points upward in the picture, of any length, not along the line of
+        - `up`: the direction that points up in the picture, of any length, not along the line of
           sight.
         - `fov`: vertical field of view, degrees, between 0 and 180.
         - `width`, `height`: size of the picture, pixels.
-        - `near`: splats nearer than this are not rendered, mm.
+        - `near`: splats nearer than this (mm) are not rendered.
 
-        **Raises:** `ValueError` when the field of view or the size of the picture is out of range,
-        when `eye` equals `target`, and when `up` is along the line of sight; the last two are not
-        checked for traced arrays.
+        **Raises:** `ValueError` if the field of view or the size of the picture is out of range, if
+        `eye` equals `target`, or if `up` is along the line of sight. The last two are not checked
+        for traced arrays.
         """
         check_values("fov", fov, "between 0 and 180 degrees", lambda x: (x > 0) & (x < 180))
         points = as_floats([eye, target, up], name="eye, target and up")
@@ -137,14 +137,14 @@ def rotation_towards(forward: Float[Array, "3"], up: Float[Array, "3"]) -> Float
 
 
 def rotation_by(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    r"""Compute the rotation around a vector by its length, radians. Differentiable at 0, too.
+    r"""Compute the rotation about a vector by its length in radians. Differentiable, also at 0.
 
         R = 1 + sin(t) / t [v] + (1 - cos t) / t^2 [v]^2,   t = |v|
 
     **Source:** Rodrigues 1840.
     """
 
-    def sinc(y):  # sin(t) / t of y = t^2, near 0 by its series
+    def sinc(y):  # sin(t) / t as a function of y = t^2, by its series near 0
         is_small = y < 1e-2
         t = jnp.sqrt(jnp.where(is_small, 1.0, y))
         return jnp.where(is_small, 1 - y / 6 * (1 - y / 20 * (1 - y / 42)), jnp.sin(t) / t)
@@ -154,36 +154,37 @@ def rotation_by(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return identity + sinc(squared) * cross + 0.5 * sinc(squared / 4) ** 2 * (cross @ cross)
 
 
-_ROUNDING = 1e-5  # by which an albedo may leave [0, 1]
+_ROUNDING = 1e-5  # tolerance for albedos outside [0, 1]
 _FINITE = valid("finite; remove such splats before rendering")
 _NOT_NEGATIVE = valid("finite and at least 0", lambda x: x >= 0)
 
 
 @record
 class Splats(eqx.Module):
-    r"""The surface of a body as overlapping discs, one row per splat; mm, right-handed, +y up.
+    r"""The surface of a body as overlapping discs, one row per splat. Coordinates are in mm,
+    right-handed, with +y up.
 
     Splats that are near in space should be near in memory, as `read_splats` and `sample_mesh` sort
-    them. The order changes the time, not the picture.
+    them. The order affects the speed, not the picture.
 
     **Attributes:** (all differentiable unless stated otherwise)
 
-    - `centers`: mm. Coverage and shading are smooth functions of the centers; which splats are
-      visible is not.
-    - `normals`: unit vectors, outward.
-    - `radii`: mm, positive. Discs overlap so that they leave no hole: about 1.5 times the root of
-      the area.
-    - `areas`: the area of the surface that each splat represents, mm^2. They add up to the area of
-      the surface. (The discs overlap, so `pi r^2` is not the area.)
+    - `centers`: mm. Coverage and shading are smooth functions of the centers; visibility is
+      discontinuous.
+    - `normals`: outward unit vectors.
+    - `radii`: mm, positive; about 1.5 times the square root of the area, so that the overlapping
+      discs leave no holes.
+    - `areas`: the surface area that each splat represents, mm^2. The areas sum to the area of the
+      surface; they are not `pi r^2`, because the discs overlap.
     - `albedo`: diffuse color, linear, in [0, 1], which multiplies the color of the material; `None`
-      if the material alone gives the color.
-    - `specular`: factor on the material's specular strength; `None` for 1.
-    - `roughness`: factor on the material's roughness; `None` for 1.
-    - `weights`: factor on the material's weights, for each Gaussian and channel. It varies the
-      material over the body: freckles, lips, veins. `None` for 1.
+      for 1.
+    - `specular`: factor of the material's specular strength; `None` for 1.
+    - `roughness`: factor of the material's roughness; `None` for 1.
+    - `weights`: factor of the material's weights for each Gaussian and channel, which varies the
+      material over the body (freckles, lips, veins); `None` for 1.
 
     **Raises:** `ValueError` for arrays of different lengths, for entries that are not finite, for
-    negative radii, areas and factors, and for an albedo outside [0, 1].
+    negative radii, areas or factors, and for an albedo outside [0, 1].
     """
 
     centers: Float[Array, "splats 3"] = eqx.field(converter=numbers, metadata=_FINITE)
@@ -213,8 +214,8 @@ class Splats(eqx.Module):
         return self.centers.shape[0]
 
     def scaled(self, factor: Float[Array, ""] | float) -> "Splats":
-        """Scale the body about the origin. The distance that light travels does not change, so a
-        smaller body is more translucent.
+        """Scale the body about the origin. The distance that light travels in the material is
+        unchanged, so a smaller body is more translucent.
         """
         return eqx.tree_at(
             lambda body: (body.centers, body.radii, body.areas),
@@ -223,17 +224,19 @@ class Splats(eqx.Module):
         )
 
     def without_maps(self) -> "Splats":
-        """Remove albedo, specular and roughness: the material alone gives color and highlights."""
+        """Remove albedo, specular and roughness, so that the material alone determines color and
+        highlights.
+        """
         return dataclasses.replace(self, albedo=None, specular=None, roughness=None)
 
     def take(self, chosen: Int[Array, " chosen"]) -> "Splats":
-        """Return the splats of these ascending indices. Indices beyond the number of splats give
-        invisible splats without light.
+        """Return the splats at ascending indices. Indices past the end give invisible splats
+        without light.
         """
         return jax.tree.map(lambda leaf: take_rows(leaf, chosen), self)
 
 
-# A function that returns all splats part by part, the same parts at every call.
+# A function that iterates over all splats in parts, the same parts at every call.
 Parts: TypeAlias = Callable[[], Iterable[Splats]]
 
 
@@ -246,10 +249,10 @@ class Scene(eqx.Module):
     **Attributes:** (differentiable)
 
     - `splats`: the surface of the body.
-    - `lights`: any number, as a list, a tuple, or a single light. A light of one channel applies to
-      every channel of the material. Lights of one kind are computed together.
-    - `material`: the material of all splats. If they have an albedo, use `material.white()`, so
-      that the albedo alone gives the color.
+    - `lights`: a light, or a list or tuple of lights. A light of one channel applies to every
+      channel of the material. Lights of one kind are computed together.
+    - `material`: the material of all splats. For splats with an albedo, use `material.white()`, so
+      that the albedo alone determines the color.
     """
 
     splats: Splats
@@ -261,7 +264,7 @@ class Scene(eqx.Module):
 
 
 class Frame(eqx.Module):
-    r"""A picture, linear light, row 0 at the top.
+    r"""A picture in linear light, with row 0 at the top.
 
     `beauty`, `diffuse`, `specular`, `layers`, `albedo` and `irradiance` are premultiplied by
     coverage; `depth`, `position` and `normal` belong to the front surface and are not
@@ -269,24 +272,25 @@ class Frame(eqx.Module):
 
     **Attributes:**
 
-    - `beauty`: `diffuse + specular`, and `single_scattering` where there is one; radiance.
-    - `coverage`: in [0, 1].
-    - `depth`: along the camera's forward axis, mm; inf where no surface is visible.
-    - `position`: world space, mm; 0 where no surface is visible.
-    - `normal`: world space, unit; 0 where no surface is visible.
+    - `beauty`: radiance, `diffuse + specular`, plus `single_scattering` if the material has it.
+    - `coverage`: the fraction of each pixel that the body covers, in [0, 1].
+    - `depth`: distance along the camera's forward axis, mm; inf where no surface is visible.
+    - `position`: in world space, mm; 0 where no surface is visible.
+    - `normal`: unit vector in world space; 0 where no surface is visible.
     - `albedo`: albedo of the splats; 1 if they have none.
-    - `shadow`: per light, 1 lit and 0 in shadow, not premultiplied; 1 where no surface is visible.
-    - `irradiance`: the irradiance that enters the surface, including cosine, shadow and the loss to
-      the specular lobe.
-    - `layers`: one per Gaussian: the radiance of the light that this Gaussian spreads, before its
-      weight is applied.
+    - `shadow`: visibility of each light, from 0 in shadow to 1, not premultiplied; 1 where no
+      surface is visible.
+    - `irradiance`: the irradiance that enters the surface, after cosine, shadow and the loss to the
+      specular lobe.
+    - `layers`: one per Gaussian, the radiance of light that this Gaussian spreads, without its
+      weight.
     - `weights`: the weights with which the layers add up to `diffuse`.
     - `diffuse`, `specular`: radiance.
-    - `unresolved_fraction`: per Gaussian, the fraction of its layer that the splats do not resolve,
-      averaged over the covered pixels; the surface's own irradiance replaces this fraction.
-    - `single_scattering`: radiance, premultiplied; `None` when the material has none.
-    - `overflow`: 0 if the capacity of the plan suffices; otherwise the largest ratio of needed to
-      planned capacity, and the picture is NaN.
+    - `unresolved_fraction`: fraction of each layer that the splats do not resolve, averaged over
+      the covered pixels; this fraction is replaced by the irradiance at the surface point.
+    - `single_scattering`: radiance, premultiplied; `None` if the material has none.
+    - `overflow`: 0 if the capacity of the plan suffices. Otherwise it is the largest ratio of
+      needed to planned capacity, and the picture is NaN.
     """
 
     beauty: Float[Array, "height width channels"]
@@ -306,8 +310,8 @@ class Frame(eqx.Module):
     single_scattering: Float[Array, "height width channels"] | None = None
 
     def _repr_png_(self) -> bytes | None:
-        """Encode the picture for a notebook like `splatjax.write_png`; `None` for a batch, and for
-        numbers of channels that cannot be displayed.
+        """Encode the picture for a notebook as `splatjax.write_png` does; `None` for a batch, and
+        for numbers of channels that cannot be displayed.
         """
         if self.beauty.ndim != 3 or self.beauty.shape[-1] not in (1, 3):
             return None

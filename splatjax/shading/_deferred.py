@@ -1,5 +1,5 @@
-"""The light that a surface receives, and pass 5: deferred shading (section 4.1), which computes the
-reflection of the rough interface, the transmission of diffuse light, and the color by the albedo.
+"""The light that a surface receives, and pass 5: deferred shading (section 4.1), with the
+reflection and transmission of the rough interface and the albedo.
 """
 
 from collections.abc import Callable
@@ -30,20 +30,19 @@ def diffuse_transmission(
     roughness: Float[Array, "..."],
     angles: AngularLaw,
 ) -> Float[Array, "channels ..."]:
-    r"""Compute the angular factor of diffuse light that leaves: `e(mu) (1 - rho(mu))` divided by
-    its average, weighted with `2 mu`. The transmission depends only on index and roughness, not on
-    the strength of the specular lobe.
+    r"""Compute the angular factor of the diffuse light that leaves: `e(mu) (1 - rho(mu))` divided
+    by its average with weight `2 mu`. The transmission depends on index and roughness, not on the
+    strength of the specular lobe.
 
-    The radiance of a surface of radiant exitance `M` is `M diffuse_transmission(mu_o) / pi`. Since
-    the average is one, the light that leaves is exactly `M`.
+    A surface with radiant exitance `M` has the radiance `M diffuse_transmission(mu_o) / pi`. Since
+    the average is 1, the light that leaves is exactly `M`.
 
-    **Arguments:** as in `directional_albedo`; `mu` is the cosine of the direction towards the
-    camera.
+    **Arguments:** as in `directional_albedo`; `mu` is the cosine of the direction to the camera.
 
     - `angles`: the law `e` of a material.
 
-    **Returns:** at least 0, with the channels of `angles` as first axis. The average is kept above
-    1e-4 (gradient 0 below): a surface that reflects all light transmits none, so `M` is 0 there.
+    **Returns:** at least 0, with the channels of `angles` as first axis. The average is clamped to
+    1e-4 (gradient 0 below), since a surface that reflects all light transmits none, and `M` is 0.
 
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14), with `e = 1`.
     """
@@ -57,12 +56,12 @@ def average_transmission(
     roughness: Float[Array, "..."],
     angles: AngularLaw,
 ) -> Float[Array, "channels ..."]:
-    """Compute the average of `e(mu) (1 - rho(mu))`, weighted with `2 mu`: the transmitted fraction
-    of uniform light, relative to light along the normal.
+    """Compute the average of `e(mu) (1 - rho(mu))` with weight `2 mu`: the transmitted fraction of
+    uniform light, relative to light along the normal.
 
     **Arguments:** as for `diffuse_transmission`.
 
-    **Returns:** with the channels of `angles` as first axis.
+    **Returns:** the average, with the channels of `angles` as first axis.
     """
     reflected = average_albedo(f0, roughness, angles.coefficients)
     total = angles.coefficients.T @ jnp.asarray(
@@ -72,12 +71,12 @@ def average_transmission(
 
 
 class SurfacePoints(eqx.Module):
-    r"""The visible points of one surface: blended attributes, ready for shading.
+    r"""The visible points of a surface, with blended attributes for shading.
 
     **Attributes:**
 
-    - `normals`: unit, or zero where there is no surface.
-    - `outgoing`: `wo`, unit, towards the eye.
+    - `normals`: unit vectors, or zero where there is no surface.
+    - `outgoing`: `wo`, the unit vectors to the eye.
     - `visibility`: per group, the fraction of each light that arrives; `None` for lights without
       shadows.
     """
@@ -91,7 +90,7 @@ class SurfacePoints(eqx.Module):
 
 
 def unit_normals(normals: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels 3"]:
-    """Scale blended normals to unit length; zero stays zero, with a zero gradient."""
+    """Normalize blended normals. Zero stays zero, with a zero gradient."""
     squared = jnp.sum(normals * normals, axis=-1, keepdims=True)
     is_surface = squared > 0
     return jnp.where(is_surface, normals / jnp.sqrt(jnp.where(is_surface, squared, 1.0)), 0.0)
@@ -100,7 +99,9 @@ def unit_normals(normals: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels 3"
 def _cosine(
     normals: Float[Array, "*pixels 3"], directions: Float[Array, "*pixels 3"]
 ) -> Float[Array, "*pixels"]:
-    """Compute the cosine between unit vectors; 0 below the horizon, which is a kink."""
+    """Compute the cosine between unit vectors, clamped to 0 below the horizon, where it has a
+    kink.
+    """
     return jnp.maximum(jnp.sum(normals * directions, axis=-1), 0)
 
 
@@ -115,17 +116,18 @@ def sum_received(
     channels: int,
 ) -> Float[Array, "channels *pixels"]:
     r"""Sum the light that a surface receives, `sum_lights irradiance max(n . wi, 0) visibility
-    factor(wi, n . wi)`, one light at a time; the backward pass recomputes each.
+    factor(wi, n . wi)`, one light at a time. The backward pass recomputes each term.
 
     **Arguments:**
 
-    - `normals`: unit.
-    - `visibility`: for each group the fraction of each light that reaches each point; `None` for
-      lights that cast no shadows.
-    - `factor`: the diffuse fraction of the light, or the reflectance towards the eye; one row for
-      all channels, or one for each.
+    - `normals`: unit vectors.
+    - `visibility`: per group, the fraction of each light that reaches each point; `None` for lights
+      without shadows.
+    - `factor`: computes the diffuse fraction of the light, or the reflectance towards the eye, with
+      one row for all channels or one per channel.
 
-    **Returns:** linear in the lights. Differentiable in everything; the horizon is a kink.
+    **Returns:** the sum, linear in the lights. Differentiable in all arguments, with a kink at the
+    horizon.
     """
 
     @jax.checkpoint
@@ -145,8 +147,8 @@ def sum_received(
 def albedo_under(
     groups: list[StackedLights], f0: Float[Array, ""], roughness: Float[Array, "*points"]
 ) -> Callable[[Float[Array, "*points"]], Float[Array, "*points"]]:
-    """Return `directional_albedo` as a function of the cosine, to be called for each light sample:
-    if there are many, the tables of the roughness are summed before.
+    """Return `directional_albedo` as a function of the cosine, to be called for each light sample.
+    For many samples, the sum over roughness is computed in advance.
     """
     if any(len(group.light_indices) > len(group.distinct) for group in groups):
         return eqx.Partial(sum_albedo, albedo_series(f0, roughness))
@@ -156,8 +158,8 @@ def albedo_under(
 def exit_transmission(
     points: SurfacePoints, f0: Float[Array, ""], angles: AngularLaw
 ) -> Float[Array, "channels *pixels"]:
-    """Compute the factor on diffuse light that leaves towards the eye, on average 1:
-    `diffuse_transmission`.
+    """Compute the factor of the diffuse light that leaves towards the eye (`diffuse_transmission`);
+    its average is 1.
     """
     return diffuse_transmission(
         _cosine(points.normals, points.outgoing), f0, points.roughness, angles
@@ -167,8 +169,8 @@ def exit_transmission(
 def reflected_radiance(
     points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], channels: int
 ) -> Float[Array, "channels *pixels"]:
-    """Compute the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light with its
-    own shadow. Extended lights have one highlight for all their samples.
+    """Compute the specular radiance towards the eye by the Kelemen / Szirmay-Kalos lobe, with the
+    shadow of each light. Extended lights have one highlight for all their samples.
     """
 
     def lobe(wi, specular=points.specular):
@@ -216,10 +218,10 @@ def single_scattered_radiance(
     f0: Float[Array, ""],
     single: SingleScattering,
 ) -> Float[Array, "channels *pixels"]:
-    """Compute the radiance of light that scatters once and leaves where it entered, each light with
-    its own shadow.
+    """Compute the radiance of light that is scattered once and leaves where it entered, with the
+    shadow of each light.
 
-    Light that the interface reflects does not enter. The surface is assumed flat and evenly lit
+    Light that the interface reflects does not enter. The surface is assumed flat and uniformly lit
     over a mean free path.
     """
     to_eye = _cosine(points.normals, points.outgoing)

@@ -1,5 +1,5 @@
 """The specular lobe of Kelemen and Szirmay-Kalos, its Fresnel term, and its tabulated directional
-and average albedo.
+and average albedos.
 """
 
 import functools
@@ -14,17 +14,17 @@ from splatjax._chunking import map_chunks
 
 ROUGHNESS_RANGE = (0.05, 1.0)
 _LOG_ROUGHNESS = np.log(ROUGHNESS_RANGE).tolist()
-_LEAST_HALF_COSINE = 1e-4  # of N.(L+V): below it the lobe's pole is cut
+_LEAST_HALF_COSINE = 1e-4  # least N.(L+V), below which the pole of the lobe is cut
 
-# Chebyshev nodes in sqrt(mu) and in log m. The square root resolves the steep part at grazing
-# angles, where the albedo goes like mu log mu; with these degrees the error is at most 1.3e-4 (a)
-# and 1.2e-4 (b) for every mu and m in range.
+# Chebyshev degrees in sqrt(mu) and in log m. The square root resolves grazing angles, where the
+# albedo varies like mu log mu. The error is at most 1.3e-4 (a) and 1.2e-4 (b) for all mu and m in
+# range.
 _MU_NODES = 18
 _ROUGHNESS_NODES = 12
-_POWERS = 8  # of the cosine, whose averages with the albedo are tabulated
+_POWERS = 8  # powers of the cosine whose averages with the albedo are tabulated
 _LEAST_MU = 1e-5
-_LEAST_F0 = 0.02  # of surfaces that reflect all light at grazing incidence
-_AT_ONCE = 1 << 14  # points whose polynomials are in memory
+_LEAST_F0 = 0.02  # least f0 of surfaces that reflect all light at grazing incidence
+_AT_ONCE = 1 << 14  # points whose polynomials are in memory at once
 
 
 def fresnel_f0(eta: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -41,12 +41,12 @@ def fresnel_f0(eta: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def grazing_reflectance(f0: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Compute the reflectance at grazing incidence, which replaces 1 in Schlick's term: 1 from an
-    f0 of 0.02 on (water), less below, so that a surface without change of index reflects nothing.
-    The fraction of uniform light that is reflected is then within 0.007 of Fresnel's for every
+    """Compute the reflectance at grazing incidence, which replaces 1 in Schlick's term. It is 1 for
+    f0 of at least 0.02 (water) and falls below that, so that a surface without change of index
+    reflects nothing. The reflected fraction of uniform light is within 0.007 of Fresnel's for every
     index up to 2.
 
-    **Source:** as a step in f0, Lagarde and de Rousiers 2014, Moving Frostbite to PBR.
+    **Source:** Lagarde and de Rousiers 2014, "Moving Frostbite to PBR", as a step in f0.
     """
     deficit = jnp.maximum(1 - f0 / _LEAST_F0, 0)
     return 1 - deficit * deficit * deficit
@@ -63,11 +63,12 @@ def specular_lobe(
 ) -> Float[Array, "*points"]:
     r"""Compute the reflectance of a rough interface, `f = specular PH F(H.V) / |wi + wo|^2`.
 
-    With `a` the angle between the normal and the half vector, `PH = exp(-tan^2 a / m^2) / (pi m^2
-    cos^4 a)`; the half vector `wi + wo` is not normalized in the quotient. `F` is Schlick's, with
-    `grazing_reflectance` instead of 1. The outgoing radiance is `f (N.wi)` times the irradiance of
-    a surface that faces the light. The factor `1 / pi`, which some published shaders lack, is part
-    of it, so that the lobe never reflects more than it receives (`directional_albedo`).
+    With `a` the angle between the normal and the half vector,
+    `PH = exp(-tan^2 a / m^2) / (pi m^2 cos^4 a)`; the half vector `wi + wo` is not normalized in
+    the quotient. `F` is Schlick's, with `grazing_reflectance` instead of 1. The outgoing radiance
+    is `f (N.wi)` times the irradiance on a surface that faces the light. The lobe includes the
+    factor `1 / pi`, which some published shaders lack, so that it never reflects more than it
+    receives (`directional_albedo`).
 
     **Arguments:** directions have equal rank and broadcast; the others are scalars or broadcast
     against their leading axes.
@@ -78,9 +79,9 @@ def specular_lobe(
     - `roughness`: root mean square slope m, clamped to [0.05, 1] with gradient 0 outside.
       Differentiable.
 
-    **Returns:** 1/sr, at least 0, unchanged when `wi` and `wo` are exchanged. Where `N.wi <= 0` or
-    `N.wo <= 0` value and gradient are 0. The pole where both directions graze the surface in
-    opposite directions is cut at `N.(wi + wo) = 1e-4`.
+    **Returns:** 1/sr, at least 0, symmetric in `wi` and `wo`. Value and gradient are 0 where
+    `N.wi <= 0` or `N.wo <= 0`. The pole where `wi` and `wo` graze the surface in opposite
+    directions is cut at `N.(wi + wo) = 1e-4`.
 
     **Source:** Kelemen and Szirmay-Kalos 2001; d'Eon and Luebke 2007 (GPU Gems 3, chapter 14),
     which omits the 1/pi.
@@ -90,7 +91,7 @@ def specular_lobe(
     half_vector = wi + wo
     squared_length = jnp.sum(half_vector * half_vector, axis=-1)
     seen = (cos_i > 0) & (cos_o > 0)
-    # Outside of the lobe's domain, finite placeholders keep infinities out of the derivative.
+    # Finite placeholders outside the domain of the lobe keep infinities out of the derivative.
     squared_length = jnp.maximum(jnp.where(seen, squared_length, 2.0), _LEAST_HALF_COSINE**2)
     cosine = jnp.maximum(jnp.where(seen, cos_i + cos_o, 1.0), _LEAST_HALF_COSINE)
     squared_cosine = cosine * cosine
@@ -104,13 +105,12 @@ def specular_lobe(
 
 
 def _lobe_quadrature(mu: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Integrate the lobe over incident directions, with F = 1 and with F = (1 - H.V)^5; stacked, in
-    float64.
+    """Integrate the lobe over incident directions, with F = 1 and with F = (1 - H.V)^5, in float64.
 
-    In the slopes p of the half vector the integral is that of a Gaussian, `exp(-p^2 / m^2) / (pi
-    m^2)`, times `2 - mu (1 + p^2) / (mu - p_x sin)`, over the disc of radius `1 / mu` around
-    `(-tan, 0)`, whose rim are the directions that graze the surface. Nodes are dense at the rim
-    near the origin; beyond five m the Gaussian is negligible.
+    In the slopes p of the half vector, this is the integral of a Gaussian,
+    `exp(-p^2 / m^2) / (pi m^2)`, times `2 - mu (1 + p^2) / (mu - p_x sin)`, over the disc of radius
+    `1 / mu` around `(-tan, 0)`; on its rim, the incident directions graze the surface. Nodes are
+    dense at the rim near the origin. The Gaussian is negligible for |p| > 5 m.
     """
     mu, roughness = (x[..., None, None] for x in np.broadcast_arrays(mu, roughness))
     sine = np.sqrt(1 - mu * mu)
@@ -135,7 +135,7 @@ def _lobe_quadrature(mu: np.ndarray, roughness: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Compute the Chebyshev coefficients of (a, b) over sqrt(mu) and log m, and those over log m of
+    """Compute the Chebyshev coefficients of (a, b) in sqrt(mu) and log m, and those in log m of
     their averages with powers of mu.
     """
     mu_nodes, roughness_nodes = chebpts1(_MU_NODES), chebpts1(_ROUGHNESS_NODES)
@@ -144,7 +144,7 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
     to_mu = np.linalg.inv(chebvander(mu_nodes, _MU_NODES - 1))
     to_roughness = np.linalg.inv(chebvander(roughness_nodes, _ROUGHNESS_NODES - 1))
     coefficients = to_mu @ values @ to_roughness.T
-    # 2 mu dmu = 4 u^3 du with u = sqrt(mu): the average is exactly that of the interpolant.
+    # 2 mu dmu = 4 u^3 du with u = sqrt(mu), so the average is exactly that of the interpolant.
     x, weights = np.polynomial.legendre.leggauss(_MU_NODES)
     powers = ((1 + x) / 2) ** (3 + 2 * np.arange(_POWERS)[:, None])
     average = (2 * weights * powers) @ chebvander(x, _MU_NODES - 1)
@@ -152,7 +152,7 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _roughness_basis(roughness: Float[Array, "*points"]) -> Float[Array, "basis *points"]:
-    """Evaluate the Chebyshev polynomials of `log m`, in a loop: it compiles quickly."""
+    """Evaluate the Chebyshev polynomials of `log m` in a loop, which compiles quickly."""
     low, high = _LOG_ROUGHNESS
     t = (2 * jnp.log(jnp.clip(roughness, *ROUGHNESS_RANGE)) - (low + high)) / (high - low)
 
@@ -164,7 +164,7 @@ def _roughness_basis(roughness: Float[Array, "*points"]) -> Float[Array, "basis 
 
 
 def _with_fresnel(tables: np.ndarray, f0: Float[Array, ""]) -> Float[Array, "..."]:
-    """Combine the coefficients of tables (a, b) by Schlick's term."""
+    """Combine the coefficients of the tables (a, b) by Schlick's term."""
     constant, grazing = jnp.asarray(tables, f0.dtype)
     return f0 * constant + (grazing_reflectance(f0) - f0) * grazing
 
@@ -206,18 +206,18 @@ def directional_albedo(
     r"""Compute the fraction of light from one direction that a rough interface reflects, `rho(mu)`,
     by a specular lobe of strength 1.
 
-    `rho = f0 a(mu, m) + (g - f0) b(mu, m)`, g the `grazing_reflectance`: Schlick's term splits the
-    integral of `specular_lobe` over the hemisphere into two tables, computed once by quadrature and
-    kept as Chebyshev series in `sqrt(mu)` and `log m`.
+    Schlick's term splits the integral of `specular_lobe` over the hemisphere:
+    `rho = f0 a(mu, m) + (g - f0) b(mu, m)`, where g is the `grazing_reflectance`. The tables a and
+    b are computed once by quadrature and stored as Chebyshev series in `sqrt(mu)` and `log m`.
 
     **Arguments:** `mu` and `roughness` broadcast.
 
-    - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the slope
-      at `mu = 0` diverges like `log mu` and is cut to 0 below 1e-5.
+    - `mu`: cosine between direction and normal, clamped to [1e-5, 1]. Differentiable; the slope
+      diverges like `log mu` at `mu = 0` and is set to 0 below 1e-5.
     - `f0`: reflectance at normal incidence. Differentiable.
     - `roughness`: m, clamped to [0.05, 1] as in the lobe. Differentiable.
 
-    **Returns:** in [0, 1], within 2e-4 of the integral.
+    **Returns:** in [0, 1], with an error of at most 2e-4.
 
     **Source:** the lobe of Kelemen and Szirmay-Kalos 2001, as normalized in `specular_lobe`.
     """
@@ -235,10 +235,10 @@ def directional_albedo(
 def average_albedo(
     f0: Float[Array, "..."], roughness: Float[Array, "..."], factor: Float[Array, "powers channels"]
 ) -> Float[Array, "channels ..."]:
-    r"""Compute the fraction of uniform light that a rough interface reflects, with a factor
-    `e(mu) = sum_k c_k mu^k`: `2 int_0^1 rho(mu) e(mu) mu dmu`.
+    r"""Compute the fraction of uniform light that a rough interface reflects, with an angular
+    factor `e(mu) = sum_k c_k mu^k`: `2 int_0^1 rho(mu) e(mu) mu dmu`.
 
-    It is the exact integral of the series that `directional_albedo` evaluates, so that both are
+    This is the exact integral of the series that `directional_albedo` evaluates, so the two are
     consistent.
 
     **Arguments:** as in `directional_albedo`.

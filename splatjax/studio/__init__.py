@@ -1,6 +1,6 @@
-"""An interactive view of a scene; results that a change does not affect are reused.
-`Page` shows it in a browser, by viser
-(the extra `studio`), and `widget` in a cell of a notebook (the extra `notebooks`).
+"""An interactive view of a scene that reuses all results that a change does not affect. `Page`
+shows it in a browser with viser (the extra `studio`), and `widget` in a notebook cell (the extra
+`notebooks`).
 """
 
 from ._controls import Controls as Controls, turned as turned

@@ -17,7 +17,8 @@ class Body:
 
     **Arguments:**
 
-    - `settings`: layers that any weights can blend are kept only for the default settings.
+    - `settings`: settings of the renderer. Layers for arbitrary weights are kept only with the
+      default settings.
     """
 
     def __init__(
@@ -33,7 +34,7 @@ class Body:
         self.is_blended = eqx.tree_equal(settings, RenderSettings())
         self.kept: dict[str, tuple[Hashable, Any]] = {}
         self.is_in_environments = all(isinstance(light, EnvironmentLight) for light in lights)
-        # Directions that do not turn with the image keep their shadows.
+        # Fixed directions keep their shadows when the image turns.
         self.keeps_shadows = all(getattr(light, "directions", None) is not None for light in lights)
 
     def has(self, kind: str, depends_on: Hashable) -> bool:
@@ -41,12 +42,12 @@ class Body:
 
     def keep(self, kind: str, depends_on: Hashable, make: Callable[[], Kept]) -> Kept:
         if not self.has(kind, depends_on):
-            self.kept.pop(kind, None)  # before there are two
+            self.kept.pop(kind, None)  # free the old result first
             self.kept[kind] = depends_on, jax.block_until_ready(make())
         return self.kept[kind][1]
 
     def planned(self, make: Callable[[], Any]) -> Any:
-        """Render, with a new plan if the kept one does not suffice."""
+        """Call `make`, again with a new plan if the kept plan does not suffice."""
         rendered = make()
         if rendered.overflow > 0:
             self.kept.clear()

@@ -1,4 +1,4 @@
-"""The controls of a studio, and the changes of camera and lights that they describe."""
+"""The controls of a studio, and the changes of camera and lights that they specify."""
 
 import dataclasses
 from collections.abc import Hashable, Iterable
@@ -14,15 +14,15 @@ LAYERS = ("beauty", "diffuse", "specular", "albedo", "irradiance", "shadow")
 # The coefficients of a medium and the parameters of a skin that have sliders.
 COEFFICIENTS = {"sigma_a": "absorption", "sigma_s_prime": "scattering"}
 PIGMENTS = ("melanin", "blood", "oxygenation", "eumelanin", "bilirubin", "thickness", "scattering")
-_HIGHEST = np.radians(89)  # latitude of a camera: its up direction stays defined
+_HIGHEST = np.radians(89)  # largest latitude of a camera, so that its up direction is defined
 # The fields of lights that hold points or directions.
 _VECTORS = ("direction", "position", "origin", "center", "edges")
 
 
 @dataclasses.dataclass(frozen=True)
 class Controls:
-    r"""A state of a studio: everything that its picture depends on, except what its `Session` holds
-    fixed.
+    r"""A state of a studio: all values that its picture depends on and that may change in a
+    `Session`.
 
     **Attributes:**
 
@@ -30,16 +30,16 @@ class Controls:
     - `sigma_a`, `sigma_s_prime`: coefficients per channel, 1/mm; empty for a material without a
       medium.
     - `g`: mean cosine of the medium's phase function.
-    - `skin`: names and values of the parameters of a `Skin`; empty without one.
+    - `skin`: names and values of the parameters of a `Skin`; empty without a skin.
     - `eta`, `specular`, `roughness`: as in `Material`; the medium has the same `eta`.
-    - `factors`: one per Gaussian, by which its weights are multiplied.
-    - `scale`: factor for all weights.
+    - `factors`: factor of the weights of each Gaussian.
+    - `scale`: factor of all weights.
     - `turn`: rotation of the lights about the vertical axis, degrees.
-    - `light_stops`: for each light, the number of stops by which it is brighter.
+    - `light_stops`: change of the power of each light, stops.
     - `layer`: one of `LAYERS`.
     - `exposure`: exposure of the picture, stops.
 
-    **Raises:** `ValueError` for an unknown layer, or a `g` or factors out of range.
+    **Raises:** `ValueError` for an unknown layer, and for `g` or factors out of range.
     """
 
     eye: tuple[float, ...]
@@ -68,7 +68,7 @@ class Controls:
         skin: Skin | None,
         g: float,
     ) -> "Controls":
-        """Return the state in which nothing is changed."""
+        """Return the initial state."""
         material, medium = scene.material, scene.material.medium if skin is None else None
         return cls(
             eye=plain(camera.position),
@@ -119,11 +119,11 @@ def rotation_about_y(degrees: float) -> np.ndarray:
 
 
 def orbited(place: np.ndarray, turn: float, rise: float) -> np.ndarray:
-    """Move a camera around its target by degrees, about the y axis and upwards.
+    """Rotate a camera around its target by angles in degrees, about the y axis and upwards.
 
     **Arguments:**
 
-    - `place`: the camera's position and its target.
+    - `place`: the position and the target of the camera.
     """
     offset = rotation_about_y(turn) @ (place[0] - place[1])
     distance, level = np.linalg.norm(offset), np.linalg.norm(offset[[0, 2]])
@@ -147,8 +147,8 @@ def shifted(place: np.ndarray, across: float, down: float, fov: float) -> np.nda
 
 
 def turned(lights: Iterable[AbstractLight], degrees: float) -> tuple[AbstractLight, ...]:
-    """Turn lights about the y axis; a positive angle turns +z towards +x. The image of an
-    environment turns about its own axis, even if its `directions` are fixed.
+    """Turn lights about the y axis. A positive angle turns +z towards +x. The image of an
+    environment turns about its own axis, also if its `directions` are fixed.
 
     **Raises:** `ValueError` for a light that has neither a direction nor a position.
     """
@@ -169,7 +169,7 @@ def turned(lights: Iterable[AbstractLight], degrees: float) -> tuple[AbstractLig
 
 
 def brightened(lights: Iterable[AbstractLight], stops: Iterable[float]) -> list[AbstractLight]:
-    """Double the power of each light by its number of stops."""
+    """Multiply the power of each light by 2 to the power of its stops."""
     return [
         dataclasses.replace(
             light, **{light.strength_field: getattr(light, light.strength_field) * 2.0**stop}

@@ -1,4 +1,4 @@
-"""The studio in a cell of a notebook."""
+"""The studio in a notebook cell."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,18 +12,18 @@ if TYPE_CHECKING:
 
 
 def widget(session: Session, folder: str | Path = "studio") -> "Widget":
-    """Show a session in a cell of a notebook. Drag the picture to orbit, or with the right button
-    to pan; scroll to zoom; click for the parts of a pixel.
+    """Show a session in a notebook cell. Drag the picture to orbit, or with the right button to
+    pan; scroll to zoom; click to list the parts of a pixel.
 
-    The widget communicates through the notebook's own connection, so that the kernel may run on
-    another computer.
+    The widget communicates through the notebook's connection, so the kernel may run on another
+    computer.
 
     **Arguments:**
 
-    - `folder`: the only folder to which the widget writes, under names that it chooses; created
-      when needed.
+    - `folder`: the only folder to which the widget writes, under names that it chooses; created if
+      missing.
 
-    **Returns:** an ipywidgets widget. Its `controls` are the state that it shows.
+    **Returns:** an ipywidgets widget, whose `controls` are its current state.
 
     **Raises:** `ValueError` if ipywidgets or jupyter_rfb is not installed.
     """

@@ -1,4 +1,4 @@
-"""The page of a studio, by viser: sliders, and the picture behind them. One thread computes and
+"""The page of a studio in viser: sliders in front of the picture. A separate thread computes and
 compiles, so that the page stays responsive.
 """
 
@@ -25,14 +25,14 @@ from ._session import Session
 from ._sliders import coefficient_lines, sliders, values_of_medium
 from ._viewer import Viewer
 
-_NEAR = 1e-5  # relative, of cameras that are the same
-_QUALITY = 92  # of JPEG
+_NEAR = 1e-5  # relative difference of cameras that count as equal
+_QUALITY = 92  # JPEG quality
 _UNPICKED = "click the picture for the parts of a pixel"
-_LEFT = 0.2  # share of the free width on the left of the picture; the controls are on the right
+_LEFT = 0.2  # fraction of the free width to the left of the picture; the controls are on the right
 
 
 class Page(Viewer):
-    """A session in a browser, or at the end of a notebook's cell. All open pages show the same
+    """A session in a browser, or in the output of a notebook cell. All open pages show the same
     picture, from the camera that was moved last.
 
     **Arguments:**
@@ -40,10 +40,10 @@ class Page(Viewer):
     - `folder`: the only folder to which the page writes, under names that it chooses; created if
       missing.
     - `as_file`: see `save`.
-    - `observations`: pictures of the body; the first has the camera and lights of the session. The
-      page then offers to recover the material from them, and shows the progress of the search.
+    - `observations`: pictures of the body, the first with the camera and lights of the session.
+      With them, the page can recover the material and shows the progress of the search.
     - `host`: the address to listen on; by default only this computer can open the page.
-    - `port`: the port to listen on, or the next higher one that is free.
+    - `port`: the port to listen on; if it is in use, the next free port.
 
     **Attributes:**
 
@@ -67,15 +67,15 @@ class Page(Viewer):
 
         super().__init__(session, folder, as_file)
         if folder.exists() and not folder.is_dir():
-            raise ValueError(f"{folder} is a file; give a folder for what the page saves")
+            raise ValueError(f"{folder} is a file; give a folder for the files that the page saves")
         self._saves = list[tuple[str, Controls]]()
         self._observations = observations
         self._image, self._joined = Image.new("RGB", (1, 1)), list[Any]()
         self._changed, self._closed = threading.Event(), threading.Event()
         self._looking = threading.Lock()
-        with redirect_stdout(io.StringIO()):  # it prints an address of its own
+        with redirect_stdout(io.StringIO()):  # viser prints its own address
             self._server = server = viser.ViserServer(host, port, "splatjax", verbose=False)
-        # Viser would give the page a public address on a server of others.
+        # Viser could give the page a public address on a third-party server.
         server.request_share_url = lambda verbose=True: None
         self.url = f"http://{host}:{server.get_port()}"
         server.scene.set_up_direction("+y")
@@ -128,7 +128,7 @@ class Page(Viewer):
 
         def moved(event: Any) -> None:
             handle = event.target
-            if hasattr(handle, "min"):  # its box takes any number
+            if hasattr(handle, "min"):  # its box accepts any number
                 handle.value = min(max(handle.value, handle.min), handle.max)
             self._change()
 
@@ -136,7 +136,7 @@ class Page(Viewer):
             handle.on_update(moved)
 
     def _add_plot(self, gui: Any) -> None:
-        """Add the drawing of the profile and its fit."""
+        """Add the plot of the profile and its fit."""
         radii, *_ = curves = self._session.curves(self._session.start)
         channels = self._session.own.material.channels
         profiles, hidden = len(curves) - 1 - channels, {"points": {"show": False}}
@@ -148,7 +148,7 @@ class Page(Viewer):
         self._plot = gui.add_uplot(
             tuple(curves),
             ({"label": "r"}, *series),
-            title="r R(r) over r in mm, and its fit (narrow)",
+            title="r R(r) against r in mm, and its fit (narrow)",
             scales={"x": {"time": False, "distr": 3, "range": (float(radii[0]), float(radii[-1]))}},
             legend={"show": False},
             aspect=1.8,
@@ -161,7 +161,7 @@ class Page(Viewer):
             self._stage = gui.add_markdown("")
             self._target = to_display(np.asarray(self._observations[0].picture))
             self._compared = gui.add_image(
-                self._target, label="first picture; the page's less it (gray: the same)"
+                self._target, label="first picture; current minus first (gray: equal)"
             )
 
         def press(event: Any) -> None:
@@ -173,7 +173,7 @@ class Page(Viewer):
         buttons.on_click(press)
 
     def _follow(self, stage: str, medium: Medium | None) -> None:
-        """Show a stage of the search, and move the sliders to its medium."""
+        """Show a stage of the search, and set the sliders to its medium."""
         self._stage.content = f"```\n{stage}\n```"
         if medium is not None:
             for name, value in values_of_medium(self._session.start, medium).items():
@@ -196,9 +196,9 @@ class Page(Viewer):
     def _look(self, camera: Any) -> None:
         place = np.asarray([camera.position, camera.look_at])
         near = _NEAR * np.linalg.norm(place[0] - place[1])
-        with self._looking:  # viser calls this from several threads
+        with self._looking:  # viser calls this method from several threads
             if camera.client not in self._joined:
-                # At first viser sends cameras of its own, then the one that the page starts with.
+                # Viser first sends its own cameras, then the initial camera of the page.
                 if np.max(np.abs(place - self._first_place)) < near:
                     self._joined.append(camera.client)
                     camera.position, camera.look_at = self._place
@@ -206,11 +206,11 @@ class Page(Viewer):
             elif np.max(np.abs(place - self._place)) > near:
                 self._place = place
                 self._change()
-            else:  # its window may have another shape
+            else:  # the window may have another shape
                 self._send(camera.client)
 
     def _pick(self, event: Any) -> None:
-        """Choose the pixel that was clicked, or none outside of the picture."""
+        """Choose the pixel that was clicked, or none outside the picture."""
         camera, (x, y) = self._session.camera(self._session.start), event.screen_pos
         width, height = _canvas(camera.width, camera.height, event.client)
         column, row = int(x * width - round(_LEFT * (width - camera.width))), int(y * height)
@@ -245,7 +245,7 @@ class Page(Viewer):
             self._report(self._update)
 
     def _update(self) -> str:
-        """Show the current state, save what was requested, and return the status."""
+        """Show the current state, write the requested files, and return the status."""
         controls = self.controls
         self._show(self._session.draft(controls))
         self._plot.data = tuple(self._session.curves(controls))
@@ -260,6 +260,8 @@ class Page(Viewer):
 
 
 def _canvas(width: int, height: int, client: Any) -> tuple[int, int]:
-    """Return the size of the smallest canvas with the shape of a window that holds a picture."""
+    """Compute the size of the smallest canvas that contains a picture and has the shape of the
+    window.
+    """
     aspect = client.camera.aspect
     return max(width, round(height * aspect)), max(height, round(width / aspect))

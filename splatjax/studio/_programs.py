@@ -22,7 +22,7 @@ _WEIGHTS = _fitting.NonNegativeWeights(_fitting.FixedTotalReflectance())
 def blend(
     basis: DiffusionBasis, gaussians: SumOfGaussians, shares: Float[Array, "2"]
 ) -> Float[Array, "height width channels"]:
-    """Compute a picture from shares of its diffuse and its specular light."""
+    """Compute a picture from given shares of the diffuse and the specular light."""
     return shares[0] * (basis.beauty(gaussians) - basis.specular) + shares[1] * basis.specular
 
 
@@ -47,8 +47,8 @@ def changes_with_coefficients(
     basis: DiffusionBasis,
     place: tuple[int, int],
 ) -> list[Float[Array, " channels"]]:
-    """Differentiate the radiance of a pixel with respect to the logarithms of the named fields. A
-    channel depends only on its own coefficients.
+    """Differentiate the radiance of a pixel with respect to the logarithms of fields. Each channel
+    depends only on its own coefficients.
     """
 
     def radiance(name: str, value: Array) -> Float[Array, " channels"]:
@@ -64,7 +64,7 @@ def changes_with_coefficients(
 def weights_of(
     model: _fitting.AbstractModel, optics: Optics, variances: Float[Array, " gaussians"]
 ) -> SumOfGaussians:
-    """Fit the weights to coefficients while the variances are held."""
+    """Fit the weights to coefficients, with fixed variances."""
     return _fitting.fit_weights(model.profile(optics), variances, weights=_WEIGHTS, rule=model.rule)
 
 
@@ -72,7 +72,7 @@ def weights_of(
 def variances_and_angles(
     model: _fitting.AbstractModel, optics: Optics, variances: Float[Array, " gaussians"]
 ) -> tuple[Float[Array, " gaussians"], AngularLaw | None]:
-    """Improve the variances, if better ones lie near the given ones, and compute the angles."""
+    """Refine the variances, starting from the given ones, and compute the angular law."""
     profile, start = model.profile(optics), _fitting.GivenVariances(variances)
     fitted = _fitting.fit_gaussians(
         profile, len(variances), weights=_WEIGHTS, start=start, rule=model.rule, throw=False
@@ -90,6 +90,6 @@ def profile_curves(
     gaussians: SumOfGaussians,
     radii: Float[Array, " radii"],
 ) -> list[Float[Array, " radii"]]:
-    """Compute the profile, if there are coefficients, and the sum of Gaussians, both times r."""
+    """Compute the sum of Gaussians and, if there are coefficients, the profile, both times r."""
     profiles = [gaussians] if optics is None else [model.profile(optics), gaussians]
     return [radii * row for profile in profiles for row in profile(radii).T]

@@ -18,9 +18,9 @@ from splatjax.scattering import Skin
 from ._controls import Controls
 from ._session import Session
 
-# By what is written.
+# Suffixes by kind of file.
 SUFFIXES = {"PNG": [".png"], "EXR": [".exr"], "material": [".toml"], "scene": [".toml", ".py"]}
-# Returns a scene as its file would be, of a folder, material, lights and camera.
+# Returns the contents of a scene file in a folder, from material, lights and camera.
 AsFile = Callable[..., dict[str, Any]]
 _PROGRAM = '''"""Render {name}.png of the scene in {name}.toml, beside this file."""
 
@@ -44,21 +44,21 @@ def save(
     kind: str,
     as_file: AsFile | None = None,
 ) -> list[Path]:
-    """Write the picture (PNG), all its layers (EXR), the material, or the scene with the program
-    that makes the picture; under the next number that is free.
+    """Write the picture (PNG), all its layers (EXR), the material, or the scene and a program that
+    renders it, under the next free number.
 
     **Arguments:**
 
     - `folder`: created if missing.
-    - `as_file`: a function of a folder, material, lights and camera that returns the contents of a
-      scene file in this folder, with references to existing files of the body and the lights.
-      Without it, these files are written too.
+    - `as_file`: returns the contents of a scene file from a folder, material, lights and camera,
+      with references to existing files of the body and the lights. Without it, these files are
+      written too.
 
     **Returns:** the paths of the files.
 
-    **Raises:** `KeyError` for any other kind, `OSError` where files cannot be written.
+    **Raises:** `KeyError` for any other kind; `OSError` if a file cannot be written.
     """
-    session.picture(controls)  # whose variances and angles are those of the coefficients
+    session.picture(controls)  # fits variances and angles to the coefficients
     scene, camera = session.scene(controls), session.camera(controls)
     optics, folder = session.optics(controls), Path(folder)
     skin = optics if isinstance(optics, Skin) and controls.has_fitted_weights else None

@@ -1,4 +1,4 @@
-"""`splatjax.inverse.recover` in the background, for a page."""
+"""`splatjax.inverse.recover` in the background of a page."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -17,14 +17,14 @@ from ._session import Session
 
 
 class Search:
-    r"""Recovers the material of a session from pictures of its body, in a thread. `stop` ends the
-    search after the current round; `start` may then continue from the result.
+    r"""Recover the material of a session from pictures of its body, in a thread. `stop` ends the
+    search after the current stage; `start` can then continue from the result.
 
     **Arguments:**
 
     - `observations`: the pictures, at least one.
-    - `report`: called in the thread of the search with a description of each stage and the best
-      medium so far, and at the end with the summary, or with an error and no medium.
+    - `report`: called in the thread of the search, with a description of each stage and the best
+      medium so far, and finally with the summary, or with an error and `None`.
 
     **Raises:** `ValueError` for a material without a medium.
     """

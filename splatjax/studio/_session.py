@@ -1,4 +1,4 @@
-"""A scene that keeps intermediate results until something that they depend on changes."""
+"""A scene that keeps intermediate results until their inputs change."""
 
 from collections.abc import Hashable
 from dataclasses import replace
@@ -49,11 +49,11 @@ from ._programs import (
     weights_of,
 )
 
-_DIRECTIONS = 64  # shadow directions of an environment that turns
+_DIRECTIONS = 64  # shadow directions of a rotating environment
 _MERGED = 6  # splats of the body per splat of a draft
-_WIDER = 1.25  # additional factor for the radii of a draft, which closes holes between its splats
+_WIDER = 1.25  # additional factor of the radii in a draft, to close holes between splats
 _PLANNED = 1.2  # factor by which variances may change before a new plan is made
-# Planned cameras: degrees around the target, and distances relative to the first camera's.
+# Planned cameras: degrees around the target, and distances relative to that of the first camera.
 _QUARTERS = (0.0, 90.0, 180.0, 270.0)
 _DISTANCES = (1.0, 0.5)
 # The shares of diffuse and of specular light in a layer.
@@ -65,20 +65,20 @@ class Session:
 
     A session keeps the most recent result of each kind: the visibility of the lights, the light on
     the splats, and the layers of the view (`splatjax.DiffusionBasis`). While coefficients change,
-    the variances of the Gaussians are held, only their weights are fitted, and the kept layers are
+    the variances of the Gaussians are fixed, only their weights are fitted, and the kept layers are
     blended. If no layers are kept for a state, `draft` renders a sixth of the splats at half the
     width and height. Drafts use the default settings.
 
     **Arguments:**
 
-    - `scene`: its material has no single scattering. If the splats have an albedo, the albedo alone
-      gives the color. In drafts an environment without `directions` has 64 even ones.
+    - `scene`: its material has no single scattering. If the splats have an albedo, it alone
+      determines the color. Drafts use 64 directions of an environment without `directions`.
     - `camera`: camera of the first picture.
-    - `target`: the point at which it looks, mm.
+    - `target`: the point that the camera looks at, mm.
     - `settings`: settings of full pictures, such as bounces.
     - `exposure`: exposure of the first picture, stops.
-    - `skin`: the skin to which the material was fitted; its pigments then change instead of the
-      coefficients of a medium.
+    - `skin`: the skin to which the material was fitted; its pigments change instead of
+      coefficients.
     - `g`: mean cosine of the phase function of the material's medium.
 
     **Attributes:**
@@ -102,8 +102,8 @@ class Session:
         material = scene.material
         if material.single_scattering is not None:
             raise ValueError(
-                "the material has single scattering, beside which less light enters as the "
-                "weights grow; fit it without --single-scattering"
+                "the material has single scattering, so less light enters as the weights "
+                "grow; fit it without --single-scattering"
             )
         self.start = Controls.of(scene, camera, target, exposure, skin, g)
         self.own, self.skin, self.settings = scene, skin, settings
@@ -125,16 +125,16 @@ class Session:
         self._angles, self._settled = material.angles, self.start.coefficients
 
     def picture(self, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
-        """Compute the picture that `splatjax.render` makes of `scene(controls)`, for a display.
-        Variances and angles are first fitted to the coefficients.
+        """Fit variances and angles to the coefficients, and compute the picture that
+        `splatjax.render` makes of `scene(controls)`, encoded for a display.
         """
         self._settle(controls)
-        self._basis(self._full, controls)  # for drafts
+        self._basis(self._full, controls)  # for later drafts
         return self._show(self._still, controls)
 
     def draft(self, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
-        """Compute a picture at once: from kept layers, with the variances and angles of the last
-        `picture`, or else a coarse one.
+        """Compute a picture from kept layers, with the variances and angles of the last `picture`,
+        or else at low resolution.
         """
         is_kept = self._full.has("basis", self._keys(controls, self._full))
         return self._show(self._full if is_kept else self._coarse, controls)
@@ -157,10 +157,10 @@ class Session:
     ) -> dict[str, Float[np.ndarray, " channels"]]:
         """Decompose the radiance of a pixel.
 
-        **Returns:** for each channel, its radiance, its highlight, and the contribution of each
+        **Returns:** for each channel, the radiance, the highlight, and the contribution of each
         Gaussian, labeled by its width. If there are coefficients, also the derivatives of the
         radiance with respect to the logarithms of absorption and scattering, or of melanin and
-        blood, with the variances held.
+        blood, at fixed variances.
         """
         basis, gaussians = self._basis(self._full, controls), self._gaussians(controls)
         place, optics = (row, column), self.optics(controls)
@@ -178,7 +178,7 @@ class Session:
 
     def scene(self, controls: Controls, body: Body | None = None) -> Scene:
         """Return the scene of a state; after `picture`, the scene of that picture. Its material has
-        no medium if the weights were changed by hand.
+        no medium if the weights were changed manually.
         """
         optics, body = self.optics(controls), body or self._full
         has_medium = isinstance(optics, Medium) and controls.has_fitted_weights
@@ -228,7 +228,7 @@ class Session:
         return Medium(*(jnp.asarray(row, self._variances.dtype) for row in rows))
 
     def _fitted(self, controls: Controls) -> SumOfGaussians:
-        """Return the material's own Gaussians, or Gaussians fitted to changed coefficients."""
+        """Return the Gaussians of the material, or Gaussians fitted to changed coefficients."""
         gaussians, optics = self.own.material.gaussians, self.optics(controls)
         is_own = optics is self.optics(self.start) and self._variances is gaussians.variances
         if optics is None or is_own:
@@ -237,7 +237,7 @@ class Session:
         return self._full.keep("fit", (key, self._settled), lambda: weights_of(*inputs))
 
     def _gaussians(self, controls: Controls) -> SumOfGaussians:
-        """Return the Gaussians of a state. If splats have an albedo, factors change no color."""
+        """Return the Gaussians of a state, whose factors do not change the color of an albedo."""
         gaussians = self._fitted(controls)
         factors = jnp.asarray(controls.factors, gaussians.weights.dtype)[:, None]
         gaussians = SumOfGaussians(gaussians.variances, gaussians.weights * factors)
@@ -264,14 +264,14 @@ class Session:
             self._planned = self._variances
 
     def _keys(self, controls: Controls, body: Body) -> tuple[Hashable, Hashable]:
-        """Return keys of the light on the splats, and of the view."""
+        """Return the keys of the light on the splats and of the view."""
         state: Hashable = replace(controls, eye=(), target=(), layer=LAYERS[0], exposure=0.0)
         if body.is_blended:
             state = controls.turn, controls.light_stops, controls.eta, controls.roughness
         return (state, self._settled), (controls.eye, controls.target)
 
     def _plan(self, body: Body, controls: Controls) -> Plan:
-        """Plan for cameras and lights from all sides."""
+        """Make a plan for cameras and lights from all sides."""
 
         def make() -> Plan:
             start, scene = self.start, self.scene(controls, body)
@@ -307,7 +307,7 @@ class Session:
                 plan=self._plan(body, controls),
                 light=self._light(body, controls),
             )
-            # Less than half of the points are seen, which is what a slider then waits for.
+            # Keep only the visible points, fewer than half, so that sliders respond faster.
             is_seen = np.any(np.asarray(basis.pixel_radiance_per_exitance) != 0, axis=0)
             count = rounded_up(int(is_seen.sum()), 1, per_octave=2)
             return basis.of_points(np.argsort(~is_seen, kind="stable")[:count])

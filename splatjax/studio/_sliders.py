@@ -1,4 +1,4 @@
-"""Sliders and tables, which pages and widgets share."""
+"""Sliders and tables that pages and widgets share."""
 
 import dataclasses
 from collections import defaultdict
@@ -14,7 +14,7 @@ from splatjax.scattering import Medium
 from ._controls import COEFFICIENTS, Controls, plain
 from ._session import Session
 
-_MOST, _STOPS = 4.0, 8.0  # powers of 2, of coefficients and of light
+_MOST, _STOPS = 4.0, 8.0  # ranges in powers of 2, of coefficients and of light
 _LARGEST_G = 0.95
 _GENERAL = {
     "turn": ("turn lights, °", -180.0, 180.0),
@@ -24,7 +24,7 @@ _GENERAL = {
     "roughness": ("roughness", 0.05, 1.0),
     "eta": ("eta", 1.0, 2.5),
 }
-# Labels and ends of the pigments' sliders.
+# Labels and ranges of the sliders of pigments.
 _PIGMENTS = {
     "melanin": ("melanin", 0.0, 0.5),
     "blood": ("blood", 0.0, 0.1),
@@ -37,7 +37,7 @@ _PIGMENTS = {
 
 
 class Slider(NamedTuple):
-    """A slider for one number of a state. `controls_of` finds its value by `name`."""
+    """A slider for a number of a state, which `controls_of` looks up by `name`."""
 
     name: str
     label: str
@@ -48,14 +48,14 @@ class Slider(NamedTuple):
 
 
 def sliders(session: Session) -> dict[str, list[Slider]]:
-    """List the sliders of a session by folder. The first ones are in no folder, under ""."""
+    """List the sliders of a session by folder. Those under "" are in no folder."""
     start, folders = session.start, defaultdict[str, list[Slider]](list)
 
     def add(folder: str, name: str, label: str, low: float, high: float, value: float, *step):
         slider = Slider(name, label, min(low, value), max(high, value), value, *step)
         folders[folder].append(slider)
 
-    # The diffusion equation uses no weights.
+    # The diffusion equation does not use weights.
     has_weights = not isinstance(session.settings.diffuser, ShapeDiffuser)
     for name, slider in _GENERAL.items():
         if name != "scale" or has_weights:
@@ -78,7 +78,7 @@ def sliders(session: Session) -> dict[str, list[Slider]]:
 
 
 def controls_of(start: Controls, values: Mapping[str, Any], place: np.ndarray) -> Controls:
-    """Return the state given by the values of sliders, and by a camera's position and target."""
+    """Make a state from the values of sliders and the position and target of a camera."""
     changed = {name: value for name, value in values.items() if " " not in name}
     for field in COEFFICIENTS:
         changed[field] = tuple(
@@ -93,7 +93,7 @@ def controls_of(start: Controls, values: Mapping[str, Any], place: np.ndarray) -
 
 
 def values_of_medium(start: Controls, medium: Medium) -> dict[str, float]:
-    """Return the values of sliders for the coefficients of a medium, within the sliders' ends."""
+    """Return the values of sliders for the coefficients of a medium, clamped to their ranges."""
     values = dict[str, float]()
     for field in COEFFICIENTS:
         powers = np.log2(np.asarray(getattr(medium, field)) / np.asarray(getattr(start, field)))
@@ -109,7 +109,7 @@ def coefficient_lines(controls: Controls) -> list[str]:
 
 
 def pixel_rows(session: Session, controls: Controls, pixel: tuple[int, int]) -> list[list[str]]:
-    """Tabulate the parts of a pixel below their titles; a single cell if it shows no surface."""
+    """Tabulate the parts of a pixel under their titles; a single cell if it shows no surface."""
     parts, title = session.pixel(controls, *pixel), "pixel {}, {}".format(*pixel)
     if not np.any(parts["radiance"]):
         return [[f"{title} shows no surface"]]

@@ -1,4 +1,4 @@
-"""The common parts of a page and a widget: the state that they show, and the order of pictures."""
+"""The common parts of pages and widgets: their state, and the order of their pictures."""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -17,9 +17,10 @@ from ._sliders import controls_of, pixel_rows
 
 
 class Viewer:
-    """Shows a session: a draft of each state at once, and its full picture when nothing changes.
+    """A view of a session that shows a draft of each state immediately, and the full picture when
+    nothing changes.
 
-    A subclass adds sliders to `_handles`, by name, and decides when it calls `_finish`.
+    A subclass adds sliders to `_handles` by name, and decides when to call `_finish`.
 
     **Arguments:**
 
@@ -27,7 +28,7 @@ class Viewer:
     - `as_file`: see `save`.
     """
 
-    still = 0.15  # s without a change, after which the full picture is computed
+    still = 0.15  # seconds without a change after which the full picture is computed
 
     def __init__(self, session: Session, folder: str | Path, as_file: AsFile | None = None):
         self._session, self._folder, self._as_file = session, Path(folder), as_file
@@ -37,7 +38,7 @@ class Viewer:
 
     @property
     def controls(self) -> Controls:
-        """The state of the sliders and of the camera."""
+        """Return the state of the sliders and of the camera."""
         values = {name: handle.value for name, handle in self._handles.items()}
         return controls_of(self._session.start, values, self._place)
 
@@ -54,11 +55,11 @@ class Viewer:
         """Display the table of a pixel."""
 
     def _watched(self) -> AbstractContextManager[None]:
-        """Display that a program is being compiled."""
+        """Display when a program is being compiled."""
         return watched_compiling(lambda: self._say("compiling, once for this and later starts ..."))
 
     def _report(self, action: Callable[[], str]) -> None:
-        """Run a slow action, and display the text that it returns or its error."""
+        """Run a slow action, and display its result or its error."""
         try:
             with self._watched():
                 self._say(action())
@@ -67,7 +68,7 @@ class Viewer:
             self._say(str(error) if is_clear else f"{type(error).__name__}: {error}")
 
     def _finish(self, controls: Controls) -> str:
-        """Show the full picture, and the parts of the chosen pixel; return the status."""
+        """Show the full picture and the parts of the chosen pixel, and return the status."""
         picture = self._session.picture(controls)
         self._show(picture)
         if self._picked is not None:
@@ -75,7 +76,7 @@ class Viewer:
         return "" if picture.any() else "nothing is visible; the camera may be inside the body"
 
     def _save(self, saves: list[tuple[str, Controls]]) -> str:
-        """Save and remove kinds and states from a list; return the status, empty without any."""
+        """Write and remove all entries, kinds and states, of a list, and return the status."""
         written = list[Path]()
         while saves:
             kind, controls = saves.pop(0)

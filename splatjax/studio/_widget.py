@@ -1,5 +1,5 @@
-"""The studio in a cell of a notebook, by ipywidgets and jupyter_rfb. It communicates through the
-notebook's own connection, so that the kernel may run on another computer.
+"""The studio in a notebook cell, with ipywidgets and jupyter_rfb. It communicates through the
+notebook's connection, so the kernel may run on another computer.
 """
 
 import asyncio
@@ -23,15 +23,15 @@ from ._session import Session
 from ._sliders import coefficient_lines, sliders
 from ._viewer import Viewer
 
-_LEFT, _RIGHT = (1,), (2,)  # buttons of a mouse
-_CLICK = 3  # pixels by which a mouse may move in a click
+_LEFT, _RIGHT = (1,), (2,)  # mouse buttons
+_CLICK = 3  # pixels that the mouse may move during a click
 
 
 class _Canvas(RemoteFrameBuffer):
     """A picture that is drawn when the browser is ready for it."""
 
     def __init__(self, widget: "Widget", width: int, height: int):
-        with contextlib.redirect_stdout(io.StringIO()):  # outside of a notebook it prints
+        with contextlib.redirect_stdout(io.StringIO()):  # jupyter_rfb prints outside of notebooks
             super().__init__(
                 resizable=False,
                 cursor="grab",
@@ -48,7 +48,7 @@ class _Canvas(RemoteFrameBuffer):
 
 
 class Widget(Viewer, ipywidgets.HBox):
-    """A session in a cell of a notebook, with the controls of a `Page`. See `widget`."""
+    """A session in a notebook cell, with the controls of a `Page`; see `widget`."""
 
     def __init__(self, session: Session, folder: str | Path):
         Viewer.__init__(self, session, folder)
@@ -153,7 +153,7 @@ class Widget(Viewer, ipywidgets.HBox):
         self._canvas.request_draw()
 
     def _follow(self, event: dict[str, Any]) -> None:
-        """Move the camera as the mouse is dragged, or choose the pixel that is clicked."""
+        """Move the camera when the mouse is dragged, or choose the pixel that is clicked."""
         kind = event["type"]
         if kind == "wheel":
             target = self._place[1]

@@ -1,4 +1,4 @@
-"""Profiles by random walks, the reference that diffusion approximates."""
+"""Profiles by random walks of photons."""
 
 from collections.abc import Callable, Sequence
 
@@ -15,19 +15,18 @@ from ._results import MonteCarlo, assemble
 from ._rounds import Walk, finish
 from ._walk import AbstractIncidence, LayeredMedia, NormalIncidence
 
-# Number of simultaneous photons: their state stays in the cache of a core or two, and few lanes
-# wait for the last photon.
+# Number of simultaneous photons: few enough that their state stays in the cache of a core or two
+# and few lanes wait for the last photon.
 _MOST_LANES, _LEAST_LANES, _PHOTONS_A_LANE = 16384, 1024, 8
 
-# In free paths of the first scattering layer: so thin that light does not move sideways in a film.
+# Thickness of a film in free paths of the first scattering layer, so thin that light does not move
+# sideways.
 _FILM_THICKNESS = 1e-6
 
 
 def _shared_walks(media: LayeredMedia) -> list[np.ndarray]:
-    """Group the channels, by number, that differ in absorption and in scale alone: they share a
-    walk.
-
-    Under `jit`, where values are unknown, each channel has its own walk.
+    """Group the channels, by number, that differ only in absorption and in scale and so share a
+    walk. For traced values, each channel has its own walk.
     """
     geometry = jax.lax.stop_gradient((media.sigma_s, media.thickness, media.eta))
     if is_traced(geometry):
@@ -53,37 +52,38 @@ def monte_carlo(
     flights: int = 20_000,
     progress: Callable[[int, int], None] | None = None,
 ) -> MonteCarlo:
-    r"""Compute a profile by random walks of photons through layers: the reference for all other
-    models, for any thickness and absorption.
+    r"""Compute a profile by random walks of photons through layers of any thickness and absorption.
+    It is the reference for all other models.
 
-    Photons fly from one scattering event to the next; absorption reduces their weight; interfaces
-    reflect or refract them by Fresnel's formulas. Channels share their walks, and therefore their
-    errors, if they differ only in absorption or, in a half space of one index, only in scale.
+    Photons move from one scattering event to the next, absorption reduces their weight, and
+    interfaces reflect or refract them by Fresnel's equations. Channels that differ only in
+    absorption and in scale, such as those of a half space with one index, share their walks and
+    therefore their errors.
 
     Differentiable in `sigma_a`, `sigma_s_prime` and the optical depth of films, in forward and
-    reverse mode, by the likelihood of each path. The standard errors are constants.
+    reverse mode, by likelihood ratios of the paths. The standard errors are constants.
 
     **Arguments:**
 
     - `layers`: the layers, from the top; only the lowest may be infinite.
-    - `photons`: number of photons for each walk; errors decrease with its root.
-    - `key`: a key of `jax.random`; the same key gives the same numbers.
-    - `edges`: edges of the rings, mm; ascending. By default 128 rings whose widths grow in
-      proportion, from a fiftieth of a mean free path.
+    - `photons`: number of photons per walk; errors decrease with its square root.
+    - `key`: a key of `jax.random`; the same key gives the same result.
+    - `edges`: edges of the rings, mm, ascending. By default 128 rings with geometric spacing,
+      starting at a fiftieth of a mean free path.
     - `incidence`: `NormalIncidence()` or `DiffuseIncidence()`.
-    - `g`: mean cosine of Henyey and Greenstein's phase function, between -1 and 1; one for all
-      layers, or one for each. `sigma_s = sigma_s' / (1 - g)`.
+    - `g`: mean cosine of the Henyey-Greenstein phase function, between -1 and 1, one number or one
+      per layer; `sigma_s = sigma_s' / (1 - g)`.
     - `eta_above`, `eta_below`: indices of the neighbors relative to air.
-    - `flights`: number of flights, from one event to the next, after which a photon is given up.
-      Its remaining power is counted in `unfinished`.
-    - `progress`: called from time to time with the number of finished photons, and the number of
-      all.
+    - `flights`: largest number of flights, from one event to the next, of a photon. The power that
+      remains is counted in `unfinished`.
+    - `progress`: called about once a second with the number of finished photons and the total
+      number.
 
     **Returns:** a `MonteCarlo`.
 
-    **Raises:** `ValueError` for no scattering layer, for numbers of channels that differ, for an
-    infinite layer above another, for fewer than 2 photons, or 2^30 and more, for a `g` out of its
-    range, for edges that do not ascend, and for derivatives with respect to other arguments.
+    **Raises:** `ValueError` without a scattering layer, for unequal numbers of channels, for an
+    infinite layer above another layer, for fewer than 2 or at least 2^30 photons, for a `g` out of
+    its range, for edges that do not ascend, and for derivatives with respect to other arguments.
 
     **Source:** Wang, Jacques and Zheng 1995 (MCML); one walk for many absorptions: Kienle and
     Patterson 1996; path weights: Hayakawa et al. 2001.
@@ -141,8 +141,8 @@ def monte_carlo(
 
 @eqx.filter_jit
 def _lay_out(layers, g, eta_above, eta_below):
-    """Convert layers, from the top. A film has the index of the next scattering layer below it,
-    or else of the last one above. Also return rings as far as light leaves.
+    """Convert layers to arrays, and compute default ring edges. A film has the index of the next
+    scattering layer below it or, if there is none, of the last one above.
     """
     scattering = [layer for layer in layers if isinstance(layer, Layer)]
     top, g = jax.lax.stop_gradient(scattering[0].medium), jnp.broadcast_to(g, len(layers))
@@ -172,7 +172,7 @@ def _lay_out(layers, g, eta_above, eta_below):
 
 @eqx.filter_custom_jvp
 def _mean_moments(walk: Walk, *, progress) -> Float[Array, "channels places two"]:
-    """Compute the means of weights and of their squares, by channel and place."""
+    """Compute the means of weights and of their squares by channel and place."""
     return finish(walk, False, progress)
 
 
@@ -207,8 +207,8 @@ def _walk_of(
     key: Key[Array, ""],
     **settings,
 ) -> Walk:
-    """Set up the walk of a group of channels, each in its free paths."""
-    # The unit of length: the free path between scatterings in the first layer that scatters, mm.
+    """Set up the walk of a group of channels, with lengths in free paths of each channel."""
+    # The unit of length: the scattering free path in the first scattering layer, mm.
     unit = jax.lax.stop_gradient(1 / media.sigma_s[media.first, group])
     in_free_paths = LayeredMedia(
         media.sigma_a[:, group] * unit[None],

@@ -1,4 +1,4 @@
-"""Sums over ended photons, and the results of walks: means and standard errors."""
+"""Sums over finished photons, and the results of walks: means and standard errors."""
 
 import equinox as eqx
 import jax
@@ -10,15 +10,14 @@ from splatjax.scattering import Tabulated
 
 from ._walk import BELOW, INSIDE, PathWeights, Photons
 
-# Many equal numbers, added one by one to one ring, are off in float32: they are added to as many
-# sums of it first.
+# Adding many equal numbers to one sum is inaccurate in float32, so each ring first has this many
+# partial sums.
 _TABLES = 16
 _AT_ONCE = 32
 
 
 class Sum(eqx.Module):
-    """A running sum with its rounding error: exact to the precision of its terms after any number
-    of them.
+    """A compensated running sum, accurate to the precision of its terms after any number of them.
 
     **Source:** Neumaier 1974.
     """
@@ -40,8 +39,8 @@ class Sum(eqx.Module):
 def total(
     counts: Float[Array, " terms"], values: Float[Array, "terms moments"]
 ) -> Float[Array, " moments"]:
-    """Compute `counts @ values`, a few terms at a time: thousands of them, one after the other, are
-    off by 5e-5 in float32.
+    """Compute `counts @ values` hierarchically, a few terms at a time; a plain sum of thousands of
+    terms has an error of 5e-5 in float32.
     """
     while counts.shape[0] % _AT_ONCE == 0:
         values = jnp.einsum(
@@ -61,20 +60,18 @@ def photon_moments(
     dropped: Bool[Array, " photons"],
     edges: Float[Array, "channels edges"],
 ) -> Float[Array, "channels places moments"]:
-    """Sum weights, their squares, and their derivatives, over the photons that are done. Those
-    `dropped` were terminated at a tiny weight: what they have absorbed counts, what they carry does
-    not.
+    """Sum weights, their squares and their derivatives over the `done` photons. Photons that
+    Russian roulette `dropped` count in the absorbed light only.
 
-    **Returns:** by place: the rings above, what left farther out, the rings below, what left
-    farther out there, what was given up on its way, and what each layer has absorbed.
+    **Returns:** sums by place, in this order: the rings above, all other light that left above, the
+    rings below, all other light that left below, unfinished photons, and absorption in each layer.
     """
     rings = edges.shape[1] - 1
     radius = jnp.sqrt(photons.x * photons.x + photons.y * photons.y)
     table = jnp.arange(done.shape[0], dtype=jnp.int32) % _TABLES
 
     def leave(carried, slope, edges):
-        # Photons within the first edge and beyond the last are in no ring, and count as farther
-        # out.
+        # Photons inside the first edge and beyond the last are in no ring, and share one place.
         ring = jnp.searchsorted(edges, radius, side="right", method="scan_unrolled") - 1
         ring = jnp.where((ring < 0) | (ring >= rings), rings, ring)
         ring = jnp.where(photons.place == BELOW, ring + rings + 1, ring)
@@ -98,22 +95,21 @@ def _moments(
 
 
 class SampleMean(eqx.Module):
-    """A mean over photons and its standard error, of one shape."""
+    """A mean over photons and its standard error, of equal shape."""
 
     value: Float[Array, "..."]
     deviation: Float[Array, "..."]
 
 
 class MonteCarlo(eqx.Module):
-    r"""The fate of the light that entered, by counting photons; powers are fractions of the
-    entering light.
+    r"""The result of `monte_carlo`. Powers are fractions of the light that entered.
 
     **Attributes:**
 
     - `edges`: edges of the rings, mm.
-    - `specular`: the fraction of the arriving light that the surface reflects; [channels].
-    - `reflected`, `transmitted`: the light that leaves above and below through each ring, divided
-      by the area of the ring; 1/mm^2, [rings, channels].
+    - `specular`: the fraction of the incident light that the surface reflects; [channels].
+    - `reflected`, `transmitted`: the light that leaves above and below through each ring, per area;
+      1/mm^2, [rings, channels].
     - `total_reflectance`, `total_transmittance`: all light that leaves, at any distance;
       [channels].
     - `absorbed`: the light absorbed in each layer; [layers, channels].
@@ -132,12 +128,14 @@ class MonteCarlo(eqx.Module):
     @property
     @jit_unless_traced
     def radii(self) -> Float[Array, " rings"]:
-        """The mean radius of each ring, mm: where a straight profile has its mean over the ring."""
+        """Return the area-weighted mean radius of each ring, mm, where a linear profile equals its
+        mean over the ring.
+        """
         a, b = self.edges[:-1], self.edges[1:]
         return 2 / 3 * (a * a + a * b + b * b) / (a + b)
 
     def profile(self) -> Tabulated:
-        """Return the reflectance as a profile; its total includes light beyond the last ring."""
+        """Return the reflectance as a profile. Its total includes light beyond the last ring."""
         return Tabulated(
             self.radii,
             self.reflected.value,
@@ -153,7 +151,7 @@ def assemble(
     photons: Int[Array, ""],
     specular: Float[Array, " channels"],
 ) -> MonteCarlo:
-    """Turn means of weights and of their squares into results; errors are constants."""
+    """Compute the results from means of weights and of their squares. Errors are constants."""
     rings, divisor = edges.shape[0] - 1, (photons - 1).astype(edges.dtype)
     areas = jnp.pi * (edges[1:] ** 2 - edges[:-1] ** 2)
     above, below, unfinished, absorbed = jnp.split(

@@ -1,5 +1,5 @@
-"""Photons by lanes: each lane takes the next photon when its photon has ended. Counter-based
-uniform random numbers.
+"""Simulation of photons in lanes: a lane starts the next photon when its photon has ended.
+Counter-based uniform random numbers.
 """
 
 from collections.abc import Callable
@@ -25,17 +25,17 @@ from ._walk import (
     weigh,
 )
 
-# Flights between two looks at who is done.
+# Flights between two checks for finished photons.
 _FLIGHTS = 4
 
-# Rounds of one compiled call: a second or so, after which progress is reported.
+# Rounds of one compiled call, about a second, after which progress is reported.
 _ROUNDS = 256
 
-# Rounds between two looks at whether all are done.
+# Rounds between two checks for the end of the walk.
 _UNWATCHED = 8
 
-# A photon that carries less than this is given up, except for this share, which carries more
-# instead (Russian roulette).
+# Russian roulette: the weight below which a photon is terminated, and the probability that it
+# survives with a larger weight.
 _LEAST, _SURVIVING = 1e-4, 0.1
 
 
@@ -44,11 +44,11 @@ class Walk(eqx.Module):
 
     **Attributes:**
 
-    - `media`: of the channels that walk along. Differentiable in `sigma_a` and `sigma_s`.
-    - `edges`: of the rings, for each channel.
-    - `key`: of this walk.
-    - `photons`, `flights`: numbers of photons and of their flights. They are traced, so that they
-      need no program of their own.
+    - `media`: media of the channels that share the walk. Differentiable in `sigma_a` and `sigma_s`.
+    - `edges`: edges of the rings of each channel.
+    - `key`: the random key of this walk.
+    - `photons`, `flights`: number of photons, and most flights per photon. They are traced, so that
+      other numbers need no recompilation.
     """
 
     media: LayeredMedia
@@ -76,11 +76,11 @@ class _State(eqx.Module):
 def finish(
     walk: Walk, with_slopes: bool, progress: Callable[[int], None] | None
 ) -> Float[Array, "channels places moments"]:
-    """Walk all photons to their end, and compute means over them. Under `jit` in one loop, else
-    call by call, reporting the number of finished photons in between.
+    """Simulate all photons, and compute means over them. Under `jit` this is one loop; otherwise
+    several calls, between which the number of finished photons is reported.
 
-    **Returns:** the moments of `photon_moments`, with derivatives in the absorption of each layer,
-    then in the scattering of each; or with none.
+    **Returns:** the means of `photon_moments`; `with_slopes`, also their derivatives with respect
+    to the absorption of each layer, then the scattering of each layer.
     """
     state = _start(walk, with_slopes)
     if is_traced(state.started):
@@ -123,7 +123,9 @@ def _advance(walk: Walk, state: _State) -> _State:
 
 
 def _round(walk: Walk, state: _State) -> _State:
-    """Fly, count the photons that have ended, and start others in their lanes."""
+    """Move photons by a few flights, count those that have ended, and start others in their
+    lanes.
+    """
     draws = state.round * (_FLIGHTS + 2)
 
     def path(sigma_a, sigma_s, weights):
@@ -170,7 +172,7 @@ def _round(walk: Walk, state: _State) -> _State:
 
 
 def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
-    """Start photons in free lanes, as long as there are any left."""
+    """Start the remaining photons in free lanes."""
     dtype = walk.edges.dtype
     turn = jnp.cumsum(free.astype(jnp.int32))
     begins = free & (state.started + turn <= walk.photons)
@@ -212,17 +214,16 @@ _GOLDEN = 0x9E3779B9
 def uniforms(
     key: Key[Array, ""], number: Int[Array, ""], lanes: int, dtype
 ) -> Float[Array, "four lanes"]:
-    """Draw four independent numbers in (0, 1] for each lane, steps of 2^-24: the `number`-th of a
-    key, by Threefry 2x32 with 20 rounds.
+    """Draw four independent numbers in (0, 1] for each lane, multiples of 2^-24, by Threefry 2x32
+    with 20 rounds. `number` is the counter.
 
-    In one pass: `jax.random` enciphers the same words to the same numbers, but on a CPU it lowers
-    each round of the cipher to a loop over memory, which takes longer than all the physics of a
-    flight.
+    `jax.random` gives the same numbers, but on a CPU it lowers each round of the cipher to a loop
+    over memory, which takes longer than all other parts of a flight.
 
     **Source:** Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3".
     """
     words = jax.random.key_data(key).reshape(-1).astype(jnp.uint32)
-    # The lane is the lower word of the counter, so that a generator draws two numbers for each.
+    # The lane is the lower word of the counter; each of the two streams draws two numbers per lane.
     higher = 2 * number.astype(jnp.uint32) + jnp.arange(2, dtype=jnp.uint32)
     pairs = [
         jax.lax.rng_bit_generator(
@@ -236,10 +237,10 @@ def uniforms(
 
 
 def evenly(key: Key[Array, ""], number: Int[Array, " lanes"], dtype) -> Float[Array, " lanes"]:
-    """Draw numbers in (0, 1] that fill it evenly as `number` counts: Weyl's sequence of the golden
-    ratio, from a random start.
+    """Compute a low-discrepancy sequence in (0, 1]: the Weyl sequence of the golden ratio with a
+    random start.
 
-    Means over a smooth function of one of them are nearly exact.
+    The mean of a smooth function over the sequence is nearly exact.
     """
     word = number.astype(jnp.uint32) * jnp.uint32(_GOLDEN) + jax.random.bits(key, (), jnp.uint32)
     return ((word >> 8) + jnp.uint32(1)).astype(dtype) * 2.0**-24

@@ -1,5 +1,5 @@
-"""One flight of many photons: to the next scattering or to the next interface, whichever comes
-first; their entry, refraction and scattering.
+"""One flight of many photons, to the next scattering event or the next interface, whichever comes
+first; and their entry, refraction and scattering.
 """
 
 import abc
@@ -20,8 +20,8 @@ Direction = tuple[Float[Array, " photons"], Float[Array, " photons"], Float[Arra
 
 
 class AbstractIncidence(eqx.Module):
-    """The directions of a narrow beam inside the surface. Powers are relative to the entering
-    power.
+    """The distribution of the directions of a narrow beam after it enters. Powers are relative to
+    the entering power.
     """
 
     @abc.abstractmethod
@@ -31,19 +31,19 @@ class AbstractIncidence(eqx.Module):
         xi_angle: Float[Array, " photons"],
         eta: Float[Array, " two"],
     ) -> tuple[Direction, Float[Array, " photons"]]:
-        """Draw directions inside, and weights of mean 1, from uniform numbers and the indices
-        outside and inside.
+        """Draw directions inside, and weights with mean 1, from uniform random numbers and the
+        indices outside and inside.
         """
 
     @abc.abstractmethod
     def reflected(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        """Compute the fraction of the arriving power that does not enter, by the index inside
+        """Compute the fraction of the incident power that does not enter. `eta` is the index inside
         divided by the index outside.
         """
 
 
 class NormalIncidence(AbstractIncidence):
-    """Along the normal."""
+    """Light along the normal."""
 
     def enter(self, xi_cosine, xi_angle, eta):
         zero, one = jnp.zeros_like(xi_cosine), jnp.ones_like(xi_cosine)
@@ -54,7 +54,7 @@ class NormalIncidence(AbstractIncidence):
 
 
 class DiffuseIncidence(AbstractIncidence):
-    """Uniform radiance from all directions above: a white sky."""
+    """Uniform radiance from all directions above, a white sky."""
 
     def enter(self, xi_cosine, xi_angle, eta):
         outside, inside = (jnp.broadcast_to(index, xi_cosine.shape) for index in eta)
@@ -76,11 +76,11 @@ def fresnel(
     eta_from: Float[Array, " photons"],
     eta_to: Float[Array, " photons"],
 ) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
-    """Compute the reflectance for unpolarized light that arrives at `cosine` (0 to 1), and the
-    cosine of the transmitted light.
+    """Compute the reflectance for unpolarized light incident at `cosine` (0 to 1), and the cosine
+    of the transmitted light.
 
-    Total internal reflection is 1, with a cosine of 0. Between equal indices there is exactly no
-    reflection or refraction.
+    Total internal reflection has reflectance 1 and cosine 0. Between equal indices there is exactly
+    no reflection or refraction.
     """
     ratio = eta_from / eta_to
     squared = 1 - ratio * ratio * (1 - cosine * cosine)
@@ -93,10 +93,9 @@ def fresnel(
 def on_circle(
     xi: Float[Array, " photons"],
 ) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
-    """Compute a point of the unit circle for each number in (0, 1]; right to 1e-10.
-
-    Series for a quarter of a turn, and the double angle: a library's sine is made for arguments of
-    any size, and slow.
+    """Compute a point of the unit circle for each number in (0, 1], with an error of 1e-10. It uses
+    series for a quarter turn and the double-angle formula, because a library's sine accepts
+    arguments of any size and is slow.
     """
     half_turns = xi - 0.5
     squared = half_turns * half_turns
@@ -110,8 +109,8 @@ def on_circle(
 def of_layer(
     table: Float[Array, "layers *channels"], layer: Int[Array, " photons"]
 ) -> Float[Array, "*channels photons"]:
-    """Look up the entry of each photon's layer: by selections, which vectorize as a gather does
-    not.
+    """Look up the entry of each photon's layer, by selections because a gather does not
+    vectorize.
     """
     shape = (*table.shape[1:], *layer.shape)
     entry = jnp.broadcast_to(table[0][..., None], shape)
@@ -121,24 +120,24 @@ def of_layer(
     return entry
 
 
-# States of a photon; an idle one does not fly.
+# States of a photon. An idle lane has no photon.
 INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
 
 
 class LayeredMedia(eqx.Module):
-    r"""Layers, films among them, as arrays over channels, from the top.
+    r"""Layers, including films, as arrays over channels, from the top.
 
     **Attributes:**
 
-    - `sigma_a`, `sigma_s`: 1/mm; a film does not scatter, and has its optical depth over its
-      thickness.
+    - `sigma_a`, `sigma_s`: 1/mm; a film has `sigma_s = 0`, and `sigma_a` is its optical depth
+      divided by its thickness.
     - `thickness`: mm.
-    - `eta`: indices relative to air, those of the neighbors above and below included.
+    - `eta`: indices relative to air, including those of the neighbors above and below.
     - `g`: mean cosines of the phase function.
-    - `first`: number of the uppermost layer that scatters.
+    - `first`: index of the uppermost scattering layer.
 
-    In a walk, lengths are in the free paths between scatterings in that layer, so that all its
-    channels have one geometry.
+    In a walk, lengths are in scattering free paths of that layer, so that all channels have the
+    same geometry.
     """
 
     sigma_a: Float[Array, "layers channels"]
@@ -150,7 +149,7 @@ class LayeredMedia(eqx.Module):
 
 
 class Photons(eqx.Module):
-    """Positions of photons, in free paths; depth is from the top of their layer. Not
+    """Positions of photons, in free paths; `depth` is measured from the top of the layer. Not
     differentiated.
     """
 
@@ -165,11 +164,11 @@ class Photons(eqx.Module):
 
 
 class PathWeights(eqx.Module):
-    r"""Carried and absorbed weights of photons, in each channel of the walk.
+    r"""Carried and absorbed weights of photons in each channel of the walk.
 
     **Attributes:**
 
-    - `carried`: the share of the entering power; 1 at the start, on average.
+    - `carried`: the share of the entering power that a photon carries; its mean is 1 at the start.
     - `absorbed`: the share that each layer has absorbed.
 
     Derivatives of both have a leading axis.
@@ -185,10 +184,10 @@ def scatter(
     xi_cosine: Float[Array, " photons"],
     xi_angle: Float[Array, " photons"],
 ) -> Direction:
-    """Draw new unit directions by the phase function of the mean cosine `g`, and two uniform random
-    numbers in (0, 1) each.
+    """Sample new unit directions from the phase function with mean cosine `g`, by two uniform
+    random numbers in (0, 1).
 
-    **Source:** Henyey and Greenstein 1941; the inverse of the distribution is written without a
+    **Source:** Henyey and Greenstein 1941; the inverse distribution is written without a
     singularity at `g = 0`.
     """
     x, y, z = direction
@@ -198,7 +197,7 @@ def scatter(
     )
     sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0.0))
     along, across = (sine * coordinate for coordinate in on_circle(xi_angle))
-    # An orthonormal basis about the direction (Duff et al. 2017).
+    # An orthonormal basis around the direction (Duff et al. 2017).
     sign = jnp.where(z < 0, -jnp.ones_like(z), jnp.ones_like(z))
     a = -1 / (sign + z)
     b = x * y * a
@@ -207,7 +206,7 @@ def scatter(
         along * sign * b + across * (sign + y * y * a) + cosine * y,
         -along * sign * x - across * y + cosine * z,
     )
-    # One step of Newton's method for the inverse root keeps the length at 1.
+    # Normalize by one Newton step for the inverse square root.
     squared = turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2]
     scale = 1.5 - 0.5 * squared
     return turned[0] * scale, turned[1] * scale, turned[2] * scale
@@ -216,9 +215,9 @@ def scatter(
 def fly(
     media: LayeredMedia, photons: Photons, xi: Float[Array, "four photons"]
 ) -> tuple[Photons, Float[Array, " photons"], Bool[Array, " photons"]]:
-    """Move photons by one flight. Uniform random numbers: cosine or reflection, angle, and the next
-    free path. Also return its length in the layer where it began, 0 for a photon that does not fly,
-    and whether it ended in a scattering.
+    """Move photons by one flight, and return them, the length of the flight (0 for a photon that is
+    not inside), and whether it ended in a scattering event. `xi` are uniform random numbers for the
+    scattering cosine or reflection, the angle, and the next free path.
     """
     ux, uy, uz = photons.direction
     layer, inside = photons.layer, photons.place == INSIDE
@@ -247,7 +246,8 @@ def fly(
     )
     stays = next_place == INSIDE
     up_again = jnp.where(crosses, jnp.where(down, onward, -onward), -uz)
-    # At an interface the depth is 0 or that of the layer now entered, or met from inside, exactly.
+    # At an interface the depth is exactly 0 or the thickness of the layer, entered or reflected
+    # into.
     arrives_on_top = jnp.where(crosses, down, ~down)
     at_interface = jnp.where(
         arrives_on_top, 0.0, of_layer(thicknesses, jnp.where(stays, next_layer, layer))
@@ -281,12 +281,12 @@ def weigh(
     length: Float[Array, " photons"],
     scattered: Bool[Array, " photons"],
 ) -> PathWeights:
-    """Update weights along a flight in a layer: absorption is its mean, not sampled. Differentiable
-    in the coefficients.
+    """Update weights along a flight in a layer. Absorption is computed as a mean, not sampled.
+    Differentiable in the coefficients.
 
-    The likelihood of a path under other scattering coefficients than those it was drawn by is a
-    product over its flights and scatterings: its derivative is the path's share in that of every
-    mean. In value it is 1.
+    The likelihood ratio of a path, under scattering coefficients other than those that it was
+    sampled with, is a product over its flights and scattering events. Its value is 1; its
+    derivative is the contribution of the path to the derivative of every mean.
     """
     drawn = jax.lax.stop_gradient(sigma_s)
     ratio = jnp.where(drawn > 0, sigma_s / jnp.where(drawn > 0, drawn, 1.0), 1.0)
