@@ -270,6 +270,29 @@ def test_an_outline_is_where_the_body_ends_and_is_antialiased():
 
 
 @pytest.mark.once
+def test_an_edge_before_another_surface_is_where_the_body_ends_and_is_antialiased():
+    """A sphere before a wide sheet: its share of each pixel, against that of a disc."""
+    size, radius = 48, 10.0
+    view = bodies.perspective(width=size, height=size)
+    ball = bodies.sphere(20_000, radius, jitter=0.0)
+    body = bodies.joined(ball, bodies.sheet(40.0, 0.5, center=(0.0, 0.0, -20.0)))
+    of_ball = jnp.asarray(np.arange(body.count) < ball.count, body.radii.dtype)[None]
+    surfaces = drawn(view, body, of_ball, "tiles", by_default(ball))
+    assert np.min(seen_through(surfaces)[1]) > 0.999
+    both = surfaces.front, surfaces.behind
+    share = sum(np.asarray(each.coverage * each.attributes[0], float) for each in both)
+    scale = DISTANCE / float(view.pixel_size(jnp.asarray(DISTANCE)))
+    seen = scale * np.tan(np.arcsin(radius / DISTANCE))
+    fine = (np.arange(10 * size) + 0.5) / 10 - size / 2
+    disc = np.hypot(*np.meshgrid(fine, fine)) < seen
+    disc = disc.reshape(size, 10, size, 10).mean(axis=(1, 3))
+    assert np.sqrt(share.sum() / np.pi) == pytest.approx(seen, abs=0.12)  # pixels
+    on_edge = (disc > 0) & (disc < 1)
+    assert np.sqrt(np.mean((share - disc)[on_edge] ** 2)) < 0.12
+    np.testing.assert_allclose(share[~on_edge], disc[~on_edge], atol=0.2)
+
+
+@pytest.mark.once
 @pytest.mark.parametrize("jitter", [0.1, 0.35])
 def test_a_surface_is_covered_however_evenly_its_splats_are_spread(jitter):
     view = bodies.perspective(width=96, height=96)
