@@ -51,7 +51,7 @@ class ThinnedPlan(AbstractDiffusionPlan):
     keep: int = eqx.field(static=True)
 
     def diffuse(self, sources, variances, kernel, combination, at=None):
-        everywhere = combination.gather(sources, axis=-1)
+        everywhere = combination.gather(sources, axis=-1).of_layers(self.gaussians)
         group = np.arange(-(-everywhere.areas.shape[0] // self.keep))
         # The first splat of each group would lie on the same side of every group.
         chosen = group * self.keep + (group * _GOLDEN % 1 * self.keep).astype(int)

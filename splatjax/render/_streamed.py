@@ -68,9 +68,10 @@ def render_streamed(
     - `report`: called after each part with the name of the stage, and the number of finished
       splats.
 
-    **Returns:** the frame of `render`, to rounding except for pass 4. There each part has its own
-    clusters, and layers are evaluated at the visible points, so the difference is below the error
-    of the diffuser. There are no gradients.
+    **Returns:** the frame of `render`, to rounding but for two differences. In pass 4 each part has
+    its own clusters, and layers are evaluated at the visible points: the difference is below the
+    error of the diffuser. The shadow maps of environments and area lights are rendered from all
+    splats, as if `sample_shadows.merged_spacing` were 0. There are no gradients.
 
     **Raises:** `ValueError` when there are no splats, parts differ in size, are not the same each
     time, or the settings cannot be streamed.

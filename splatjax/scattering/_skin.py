@@ -134,8 +134,8 @@ def _pigment_absorption(
     without pigment (`baseline`).
 
     **Source:** blood with 150 g/l of hemoglobin: Prahl; melanins: Donner and Jensen 2006 (after
-    Jacques), `6.6e10 l^-3.33` and `2.9e14 l^-4.75`; baseline: Jacques 1998 (after Saidi),
-    `0.0244 + 8.53 exp(-(l - 154) / 66.2)` per cm.
+    Jacques), `6.6e10 l^-3.33` and `2.9e14 l^-4.75`; baseline: Donner and Jensen 2006
+    (after Jacques), `0.0244 + 8.53 exp(-(l - 154) / 66.2)`.
     """
     steps = jnp.linspace(_SHORTEST, _LONGEST, len(_TABLE)).astype(wavelengths.dtype)
     measured = {
@@ -145,7 +145,7 @@ def _pigment_absorption(
     return measured | {
         "eumelanin": 6.6e10 * wavelengths**-3.33,
         "pheomelanin": 2.9e14 * wavelengths**-4.75,
-        "baseline": 0.00244 + 0.853 * jnp.exp((154 - wavelengths) / 66.2),
+        "baseline": 0.0244 + 8.53 * jnp.exp((154 - wavelengths) / 66.2),
     }
 
 

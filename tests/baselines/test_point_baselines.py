@@ -20,6 +20,7 @@ from splatjax.baselines import (
     LightAtPixels,
     NearestRasterizer,
     PhongSplats,
+    ThinnedDiffuser,
     deferred_splatting,
     elliptical_points,
     layer_contrast,
@@ -235,3 +236,18 @@ def test_even_light_has_no_contrast_and_a_checkered_one_has_all():
     even, checkered = (layer_contrast(sheet, light, jnp.asarray(9.0)) for light in lights)
     np.testing.assert_allclose(even, 0, atol=1e-3)
     np.testing.assert_allclose(checkered, 1, rtol=0.02)
+
+
+def test_thinning_keeps_the_factors_of_all_splats():
+    ball = bodies.sphere(300, 10.0)
+    factors = 1 + 0.5 * jnp.sin(ball.centers[:, :1])[:, None]  # [splats, gaussians, channels]
+    light = sj.DirectionalLight((0.3, 0, -1), 1.0)
+    material = sj.Material(sj.SumOfGaussians([4.0, 9.0], [[0.4], [0.3]]))
+    ball = dataclasses.replace(ball, weights=jnp.broadcast_to(factors, (ball.count, 2, 1)))
+    scene = sj.Scene(ball, [light], material)
+    exact, thinned = (
+        sj.render(scene, camera((0, 0, 60)), sj.RenderSettings(diffuser=diffuser)).beauty
+        for diffuser in (sj.diffusion.DenseDiffuser(), ThinnedDiffuser(1))
+    )
+    np.testing.assert_allclose(thinned, exact, atol=1e-5)
+    assert np.max(exact) > 0.05
