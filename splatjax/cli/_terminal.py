@@ -140,9 +140,10 @@ def _show(draw: Callable[[int], list]) -> None:
         return
     note("a preview without scattering, shadows and gloss, while the picture is being compiled:")
     side = min(64, CONSOLE.width, 2 * CONSOLE.height - 8)  # one character shows two pixels
-    colors = [[f"rgb({red},{green},{blue})" for red, green, blue in row] for row in draw(side)]
-    for above, below in zip(colors[::2], colors[1::2], strict=True):
-        CONSOLE.print("".join(f"[{a} on {b}]▀[/]" for a, b in zip(above, below, strict=True)))
+    with contextlib.suppress(Exception):  # a preview must never end the picture
+        colors = [[f"rgb({red},{green},{blue})" for red, green, blue in row] for row in draw(side)]
+        for above, below in zip(colors[::2], colors[1::2], strict=True):
+            CONSOLE.print("".join(f"[{a} on {b}]▀[/]" for a, b in zip(above, below, strict=True)))
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:

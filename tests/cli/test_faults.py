@@ -335,6 +335,28 @@ def test_a_preview_is_upright_and_lit_from_where_the_light_is():
     assert red[:14].sum() > 1.3 * red[14:].sum()
 
 
+FAR, AHEAD, DISK = [0, 0, 1e5], [0, 0, -3], 2e10 / np.pi
+
+
+@pytest.mark.parametrize(
+    "light",
+    [
+        sj.DirectionalLight(AHEAD, 2.0),
+        sj.PointLight(FAR, 2e10),
+        sj.scene.SpotLight(FAR, AHEAD, 2e10),
+        sj.GaussianBeam(FAR, AHEAD, 4e8 * np.pi, 1e8),
+        sj.scene.DiskLight(FAR, DISK, AHEAD, 1.0),
+        sj.scene.RectangleLight.facing(FAR, [0, 0, 0], 1.0, 1.0, 2e10),
+        sj.scene.SphereLight(FAR, DISK, 1.0),
+    ],
+)
+def test_a_preview_shows_every_kind_of_light(light):
+    scene, camera = sj.Scene(sphere(3000), light, sj.load_material("marble")), view((9, 9, 40))
+    samples = light.samples(), [sj.DirectionalLight([0, 0, -1], 2.0)]
+    pictures = [rough_picture(scene, sampled, camera, 0.0, 28) for sampled in samples]
+    assert np.abs(np.subtract(*pictures)).max() <= 1
+
+
 def test_a_preview_compiles_nothing(compiled):
     """It is drawn while JAX compiles a program, which may be one that it would need."""
     sampled, other = (sj.EnvironmentLight(np.ones((6, 12, 3)), count=count) for count in (16, 19))
@@ -345,6 +367,12 @@ def test_a_preview_compiles_nothing(compiled):
     assert len(compiled) == before
     other.samples()
     assert len(compiled) > before
+
+
+def test_a_preview_that_fails_does_not_end_the_picture(console):
+    console(Terminal())
+    with _terminal.preview(mock.Mock(side_effect=AttributeError("direction"))):
+        jax.monitoring.record_event("/jax/compilation_cache/cache_misses")
 
 
 @pytest.mark.parametrize(
