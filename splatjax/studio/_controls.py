@@ -15,6 +15,7 @@ LAYERS = ("beauty", "diffuse", "specular", "albedo", "irradiance", "shadow")
 COEFFICIENTS = {"sigma_a": "absorption", "sigma_s_prime": "scattering"}
 PIGMENTS = ("melanin", "blood", "oxygenation", "eumelanin", "bilirubin", "thickness", "scattering")
 _HIGHEST = np.radians(89)  # largest latitude of a camera, so that its up direction is defined
+_VERTICAL = 1e-3  # sine of the angle to the y axis below which a line of sight is vertical
 # The fields of lights that hold points or directions.
 _VECTORS = ("direction", "position", "origin", "center", "edges")
 
@@ -103,6 +104,18 @@ class Controls:
     def coefficients(self) -> Hashable:
         return self.sigma_a, self.sigma_s_prime, self.g, self.skin, self.eta
 
+    def camera(self, first: Camera, start: "Controls") -> Camera:
+        """Return the camera of the state: `first` in the view of the start; elsewhere `first` moved
+        and turned, with +y up in the picture, or its own upward direction for a vertical view.
+        """
+        if np.allclose((self.eye, self.target), (start.eye, start.target)):
+            return first
+        offset = np.subtract(self.eye, self.target)
+        is_vertical = np.hypot(offset[0], offset[2]) < _VERTICAL * np.linalg.norm(offset)
+        up = -first.rotation[1] if is_vertical else (0.0, 1.0, 0.0)
+        rotation = Camera.look_at(self.eye, self.target, up=up).rotation
+        return dataclasses.replace(first, position=self.eye, rotation=rotation)
+
 
 def plain(values: Numbers) -> tuple[float, ...]:
     return tuple(np.asarray(values, np.float64).tolist())
@@ -134,15 +147,12 @@ def orbited(place: np.ndarray, turn: float, rise: float) -> np.ndarray:
     return np.asarray([place[1] + offset, place[1]])
 
 
-def shifted(place: np.ndarray, across: float, down: float, fov: float) -> np.ndarray:
-    """Move a camera and its target so that the picture shifts by fractions of its height.
-
-    **Arguments:**
-
-    - `fov`: vertical field of view, degrees.
+def shifted(place: np.ndarray, across: float, down: float, camera: Camera) -> np.ndarray:
+    """Move the place of a camera, its position and target, so that the picture shifts by fractions
+    of its height.
     """
-    right, below = np.asarray(Camera.look_at(*place).rotation)[:2]
-    height = 2 * np.linalg.norm(place[0] - place[1]) * np.tan(np.radians(fov / 2))
+    right, below = np.asarray(camera.rotation)[:2]
+    height = np.linalg.norm(place[0] - place[1]) / float(camera.focal_length)
     return place - height * (across * right + down * below)
 
 

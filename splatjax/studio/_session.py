@@ -73,7 +73,7 @@ class Session:
 
     - `scene`: its material has no single scattering. If the splats have an albedo, it alone
       determines the color. Drafts use 64 directions of an environment without `directions`.
-    - `camera`: camera of the first picture.
+    - `camera`: camera of the first picture. From other places it is upright.
     - `target`: the point that the camera looks at, mm.
     - `settings`: settings of full pictures, such as bounces.
     - `exposure`: exposure of the first picture, stops.
@@ -106,7 +106,7 @@ class Session:
                 "grow; fit it without --single-scattering"
             )
         self.start = Controls.of(scene, camera, target, exposure, skin, g)
-        self.own, self.skin, self.settings = scene, skin, settings
+        self.own, self.skin, self.settings, self._own_camera = scene, skin, settings, camera
         self.fov = float(np.degrees(2 * np.arctan(0.5 / camera.focal_length)))
         few = jax.tree.map(lambda leaf: leaf[::_MERGED], scene.splats)
         radii, areas = _WIDER * _MERGED**0.5 * few.radii, _MERGED * few.areas
@@ -196,8 +196,8 @@ class Session:
 
     def camera(self, controls: Controls, body: Body | None = None) -> Camera:
         """Return the camera of a state."""
-        size = (body or self._full).size
-        return Camera.look_at(controls.eye, controls.target, fov=self.fov, **size)
+        own = replace(self._own_camera, **(body or self._full).size)
+        return controls.camera(own, self.start)
 
     def curves(self, controls: Controls) -> list[np.ndarray]:
         """Compute the curves of a plot of the profile and its fit.

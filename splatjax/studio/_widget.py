@@ -168,7 +168,8 @@ class Widget(Viewer, ipywidgets.HBox):
         elif kind == "pointer_move" and event["buttons"] == _LEFT:
             self._look(orbited(self._place, -180 * across, 180 * down))
         elif kind == "pointer_move" and event["buttons"] == _RIGHT:
-            self._look(shifted(self._place, across, down, self._session.fov))
+            camera = self._session.camera(self.controls)
+            self._look(shifted(self._place, across, down, camera))
         elif kind == "pointer_up" and self._pressed is not None:
             if np.hypot(*np.subtract(at, self._pressed)) < _CLICK:
                 self._picked = int(at[0]), int(at[1])

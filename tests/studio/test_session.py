@@ -15,7 +15,7 @@ from PIL import Image
 import splatjax as sj
 from splatjax.diffusion import ShapeDiffuser
 from splatjax.scattering import HalfSpace
-from splatjax.studio import Search, save, turned
+from splatjax.studio import Search, Session, save, turned
 
 # Levels of 255: rounding.
 SAME = 1
@@ -45,6 +45,24 @@ def test_a_picture_is_that_of_render(studio, states, name):
     frame = sj.render(studio.scene(controls), studio.camera(controls))
     assert np.abs(shown(frame, controls) - picture).max() <= SAME
     assert draft.mean() == pytest.approx(picture.mean(), rel=COARSE)
+
+
+@pytest.mark.parametrize(
+    ("eye", "up", "moved"),
+    [
+        ((20.0, 0.0, 70.0), (1.0, 0.0, 0.0), (70.0, 0.0, 20.0)),
+        ((0.0, 70.0, 0.0), (0.0, 0.0, -1.0), (0.0, 80.0, 0.0)),
+    ],
+)
+def test_the_first_camera_is_the_one_given_and_others_are_upright(studio, eye, up, moved):
+    camera = sj.Camera.look_at(eye, (0, 0, 0), up=up, fov=20, width=24, height=16, near=5)
+    camera = with_(camera, principal_point=(0.3, 0.4))
+    session = Session(studio.own, camera, [0, 0, 0])
+    assert eqx.tree_equal(session.camera(session.start), camera)
+    up = up if moved[0] == 0 else (0, 1, 0)
+    expected = sj.Camera.look_at(moved, (0, 0, 0), up=up, fov=20, width=24, height=16, near=5)
+    expected = with_(expected, principal_point=(0.3, 0.4))
+    assert_close(session.camera(with_(session.start, eye=moved)), expected, atol=1e-6)
 
 
 @pytest.mark.long
