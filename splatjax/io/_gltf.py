@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from splatjax._records import check_values
 from splatjax.exports import gltf_volume, plain_numbers
 from splatjax.geometry import Mesh
 from splatjax.scene import (
@@ -48,13 +49,14 @@ def save_gltf(
     A warning reports contents that glTF cannot store: lights of other kinds, and a principal point
     away from the middle of the picture.
 
-    **Raises:** `ValueError` for a suffix other than .glb, and for a material of neither one nor
-    three channels; `OSError` if the file cannot be written.
+    **Raises:** `ValueError` for a suffix other than .glb, for a `lux` that is not positive, and for
+    a material of neither one nor three channels; `OSError` if the file cannot be written.
     """
     import trimesh  # takes a second
     from trimesh.exchange.gltf import export_glb
 
     check_suffix(path, ".glb")
+    check_values("lux", lux, "positive", lambda x: x > 0)
     body = body_mesh(scene.splats, mesh)
     colors = None if body.colors is None else np.round(255 * body.colors).astype(np.uint8)
     shown = trimesh.Trimesh(

@@ -105,10 +105,12 @@ def load_lights(
     - `mm_per_unit`: length of the file's unit, mm; glTF prescribes meters (1000).
     - `up`: the file's upward axis, `"y"` or `"z"`; lights have +y up.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read.
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read or `lux` is not
+    positive.
     """
     path, lights = existing_file(path), []
     check_units(path, mm_per_unit, up)
+    check_values("lux", lux, "positive", lambda x: x > 0)
     with one_sentence(path):
         for _, light, matrix in gltf_nodes(path, "light"):
             color = np.asarray(light.get("color", (1, 1, 1))) * lux * light.get("intensity", 1)

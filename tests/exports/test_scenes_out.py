@@ -205,6 +205,9 @@ def test_what_cannot_be_written_is_named(tmp_path, monkeypatch):
             (save_usd, tmp_path / "it.usdz", a_scene()),
         ):
             assert_refused(partial(save, path, given, CAMERA), path.name)
+        for lux in (0.0, -1.0, np.nan):
+            assert_refused(partial(save_gltf, glb, a_scene(), CAMERA, lux=lux), "lux must be")
+            assert_refused(partial(load_lights, glb, mm_per_unit=1.0, lux=lux), "lux must be")
         monkeypatch.setattr(util, "find_spec", lambda name: None)
         assert_refused(partial(save_usd, usda, a_scene(), CAMERA), r"it\.usda: .*usd-core")
     assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
