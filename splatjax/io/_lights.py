@@ -164,15 +164,16 @@ def read_observations(path: StrPath) -> list[Observation]:
 
 def picture_paths(path: StrPath) -> list[Path]:
     """Return the path of a file of observations, followed by the paths of the files that it
-    lists.
+    lists: pictures, masks and images of environments.
     """
     path = Path(path)
     pictures = read_toml(path, "name one that lists pictures")["pictures"]
     return [path] + [
-        path.parent / entry[name]
+        path.parent / table[name]
         for entry in pictures
-        for name in ("file", "mask")
-        if name in entry
+        for table in (entry, *entry["lights"])
+        for name in ("file", "mask", "image")
+        if name in table and table[name] not in ENVIRONMENTS
     ]
 
 

@@ -118,6 +118,13 @@ def path(tmp_path):
     return tmp_path / "pictures.toml"
 
 
+def test_images_of_environments_belong_to_the_files_of_a_list(path):
+    images = [f'[[pictures.lights]]\nimage = "{name}"' for name in ("sky.exr", "sun")]
+    path.write_text("\n".join([PICTURES, *images]))
+    names = [each.name for each in sj.io.picture_paths(path)]
+    assert names == ["pictures.toml", "one.exr", "mask.exr", "one.exr", "sky.exr"]
+
+
 def test_what_is_written_is_read(path):
     path.write_text(PICTURES)
     names = [each.name for each in sj.io.picture_paths(path)]
