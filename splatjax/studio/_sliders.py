@@ -16,6 +16,7 @@ from ._session import Session
 
 _MOST, _STOPS = 4.0, 8.0  # ranges in powers of 2, of coefficients and of light
 _LARGEST_G = 0.95
+_LEAST = 1e-30  # 1/mm: avoids division by 0
 _GENERAL = {
     "turn": ("turn lights, °", -180.0, 180.0),
     "exposure": ("exposure, stops", -_STOPS, _STOPS),
@@ -93,10 +94,13 @@ def controls_of(start: Controls, values: Mapping[str, Any], place: np.ndarray) -
 
 
 def values_of_medium(start: Controls, medium: Medium) -> dict[str, float]:
-    """Return the values of sliders for the coefficients of a medium, clamped to their ranges."""
+    """Return the values of sliders for the coefficients of a medium, clamped to their ranges. A
+    coefficient that is 0 at the start stays 0, because sliders are factors.
+    """
     values = dict[str, float]()
     for field in COEFFICIENTS:
-        powers = np.log2(np.asarray(getattr(medium, field)) / np.asarray(getattr(start, field)))
+        found, first = (np.maximum(getattr(x, field), _LEAST) for x in (medium, start))
+        powers = np.log2(found / first)
         for number, power in enumerate([0.0, *np.clip(powers, -_MOST, _MOST).tolist()]):
             values[f"{field} {number}"] = power
     return values

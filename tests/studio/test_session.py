@@ -16,6 +16,7 @@ import splatjax as sj
 from splatjax.diffusion import ShapeDiffuser
 from splatjax.scattering import HalfSpace
 from splatjax.studio import Search, Session, save, turned
+from splatjax.studio._sliders import values_of_medium
 
 # Levels of 255: rounding.
 SAME = 1
@@ -151,6 +152,15 @@ def test_a_material_is_saved_with_coefficients_only_if_they_give_its_weights(stu
         assert (sj.load_material(path).medium is not None) == is_fitted
         total = studio.own.material.total_reflectance() * controls.scale
         np.testing.assert_allclose(sj.load_material(path).total_reflectance(), total, rtol=1e-5)
+
+
+def test_a_coefficient_of_zero_stays_zero(studio):
+    _, second, third = studio.start.sigma_a
+    start = with_(studio.start, sigma_a=(0.0, 0.0, third))
+    found = sj.Medium([0.0, second, 2 * third], start.sigma_s_prime, 1.5)
+    values = values_of_medium(start, found)
+    powers = [values[f"sigma_a {channel}"] for channel in range(4)]
+    np.testing.assert_allclose(powers, [0, 0, 4, 1], atol=1e-6)
 
 
 def test_factors_change_colors_or_only_widths_where_splats_have_color(studio, another):
