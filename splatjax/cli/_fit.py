@@ -97,8 +97,7 @@ class Fit:
             help="Fit all media of a CSV file, with the columns sigma_a, sigma_s_prime "
             "(1/mm), eta, and optionally a name; --output is then a CSV file. Finished "
             "batches are kept; after an interruption, run the same command again. If a "
-            "launcher starts several processes (docs/devices.md), they share the "
-            "work."
+            "launcher starts several processes (docs/devices.md), they share the work."
         ),
     ] = False
     #: TOML file to write the material to.
@@ -122,6 +121,8 @@ class Fit:
                 "g": (self.g is None or abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
             },
         )
+        if self.model != "monte-carlo":
+            check_unused(self, ["photons"], "--model is not monte-carlo")
         with jax.enable_x64(True):
             self._run_all() if self.all else self._run()
 
@@ -204,9 +205,8 @@ class Fit:
             from splatjax.plots import plot_fit  # loads matplotlib
 
             title = f"{self.medium}, {counted(len(fitted.gaussians.variances), 'Gaussian')}"
-            save_figure(
-                plot_fit(target.profile, fitted.gaussians, rule=target.rule, title=title), self.plot
-            )
+            figure = plot_fit(target.profile, fitted.gaussians, rule=target.rule, title=title)
+            save_figure(figure, self.plot)
 
     def _note_error(self, target: _models.Reference, fitted: sj.fitting.FitResult) -> None:
         """Print a note about a large error, and whether different widths of channels cause it."""

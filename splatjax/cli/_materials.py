@@ -255,6 +255,8 @@ class Sample:
                 )
             },
         )
+        if self.share is None:
+            check_unused(self, ["material"], "it is only for --share")
         excluded = {"mesh", "count", "output", "material", "second", "share"}
         options = {key: vars(self)[key] for key in vars(self).keys() - excluded}
         if self.second is not None:

@@ -98,6 +98,7 @@ class Recover:
     def run(self) -> None:
         check_output(self.output, (".toml",))
         check_output(self.report, FIGURES)
+        most = sj.fitting.LeastCount.max_count
         check_options(
             self,
             {
@@ -106,6 +107,7 @@ class Recover:
                     f"lie between 1 and {_LARGEST_ETA:g}: marble has 1.5, skin 1.4",
                 ),
                 "g": (abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
+                "count": (1 <= self.count <= most, f"lie between 1 and {most}"),
                 "start": (
                     len(self.start) > 0,
                     "name one or more materials (`splatjax materials` lists them)",

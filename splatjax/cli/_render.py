@@ -16,19 +16,13 @@ import tyro
 
 import splatjax as sj
 
-from ._scene import (
-    camera_of,
-    draw,
-    identified,
-    note_unresolved,
-    rough_picture,
-    scene_contents,
-)
+from ._scene import camera_of, draw, identified, note_unresolved, rough_picture, scene_contents
 from ._terminal import (
     Rules,
     check_folder,
     check_options,
     check_output,
+    check_unused,
     complete,
     option_name,
     preview,
@@ -56,10 +50,13 @@ class PictureOptions(ViewOptions):
     half: bool = False
 
     def check(self, more_rules: Rules | None = None) -> None:
+        has_environment = self.environment_name is not None
+        if self.table is not None:
+            has_environment = "'environment'" in str(self.table.entries.get("lights"))
         rules: Rules = {
             "background": (
-                self.background != "environment" or self.environment_name is not None,
-                "be black or transparent with single lights and no --environment",
+                self.background != "environment" or has_environment,
+                "be black or transparent if no light is an environment",
             ),
         }
         super().check(rules | (more_rules or {}))
@@ -89,10 +86,11 @@ class PictureOptions(ViewOptions):
             half=self.half,
             wavelengths=material.wavelengths,
         )
-        if widths and self.scattering:
+        if widths:
             note_unresolved(frame, scene, settings.kernel, count or scene.splats.count)
-        if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
-            shown = lights[0].behind(frame, camera)
+        if self.background == "environment":
+            environment = next(light for light in lights if isinstance(light, sj.EnvironmentLight))
+            shown = environment.behind(frame, camera)
         shown = sj.io.picture_to_rgb(np.asarray(shown), material.wavelengths, self.illuminant)
         if self.background == "transparent":
             colors = np.repeat(shown, 3 // shown.shape[-1], axis=-1)  # for a gray scene
@@ -167,8 +165,12 @@ class Render(PictureOptions):
                     "diffusion": (self.diffusion == "clusters", "be clusters with --stream"),
                 },
             )
-        if self.camera_file is not None:
-            self.camera(tuple, self.azimuth)  # read the file before any computation
+        if self.camera_file is None:
+            check_unused(self, ["camera_unit"], "there is no --camera")
+        else:  # read the file before any computation, and place the fill beside the camera
+            check_unused(self, ("azimuth", "elevation", "fov", "width"), "--camera gives the view")
+            x, _, z = -self.camera(tuple, self.azimuth).rotation[2]
+            self = replace(self, azimuth=math.degrees(math.atan2(x, z)))
         if self.table is None and self.splats and self.stream:
             pictured = self._streamed(self.splats)
         else:

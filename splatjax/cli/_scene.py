@@ -99,9 +99,11 @@ def note_unresolved(frame: sj.Frame, scene: sj.Scene, kernel: Any, count: int) -
     frame.
     """
     unresolved = np.asarray(frame.unresolved_fraction) > 0.5
-    if not unresolved.any():
+    variances = np.asarray(scene.material.gaussians.variances)
+    is_opaque = np.max(variances) <= scene.material.opaque().gaussians.variances[0]
+    if is_opaque or not unresolved.any():
         return
-    deviations = np.sqrt(scene.material.gaussians.variances)[unresolved]
+    deviations = np.sqrt(variances)[unresolved]
     interval = np.asarray(kernel.interval(sj.diffusion.unevenness(scene.splats)))
     # Half of a layer is resolved if its variance is in the middle of the interval.
     needed = count * np.mean(scene.splats.areas) * np.mean(interval**2) / deviations[-1] ** 2

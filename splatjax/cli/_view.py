@@ -107,6 +107,10 @@ class ViewOptions:
             check_unused(self, ["count"], f"the splats are those of {self.splats}")
         if self.environment is not None:
             check_unused(self, _SINGLE_LIGHT, "--environment replaces the single light")
+        if self.environment_name is None:
+            check_unused(self, ["environment_rotation"], "single lights replace the environment")
+        if self.splats is None and getattr(self, "camera_file", None) is None:
+            check_unused(self, ["up"], "there are no SPLATS and no --camera")
         source = "material" if self.table is None else "splats"
         material = sj.load_material(self.material_source)
         is_spectral = material.wavelengths is not None

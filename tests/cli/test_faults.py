@@ -1,8 +1,7 @@
 """What a terminal shows: exit status and message of the program when something goes wrong; help,
-versions, and words that it does not know; a preview while `splatjax render` compiles.
+versions, and words that it does not know.
 """
 
-import io
 import os
 import re
 import shlex
@@ -17,14 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from bodies import sphere, view
-from commands import ball, failure, plate, run
-from rich.console import Console
+from commands import failure, plate, run
 
 import splatjax as sj
-from splatjax.cli import _main, _materials, _terminal, main
+from splatjax.cli import _materials, _terminal, main
 from splatjax.cli._main import _COMMANDS
-from splatjax.cli._render import rough_picture
 
 MEDIUM = """[medium]
 unit = "1/mm"
@@ -51,6 +47,7 @@ MEDIA = {
     "media.csv": "name,sigma_a,sigma_s_prime,eta\na,0.002,2.6,1.5\n",
     "dark.toml": "[skin]\nmelanin = 0.15\n",
     "scene.toml": 'material = "marble"\n',
+    "lit.toml": 'material = "marble"\n[splats]\n[[lights]]\nkind = "directional"\n',
 }
 REFUSED = {
     # Inputs that are missing, or something else.
@@ -68,6 +65,7 @@ REFUSED = {
     "render --material marbel": ["marbel"],
     "render plate.ply --camera missing.json": ["missing.json", "no such file"],
     "render plate.ply --camera picture.png:a": ["picture.png", "not a file of cameras"],
+    "render lit.toml --background environment": ["--background", "no light is an"],
     "render missing.toml": ["missing.toml", "no such file"],
     # Contents.
     "render scene.toml": ["scene.toml", "[splats] must be a table"],
@@ -105,7 +103,7 @@ REFUSED = {
     "render missing.ply --environment-rotation nan": ["--environment-rotation", "nan"],
     "render plate.ply --environment missing.hdr": ["missing.hdr"],
     "render plate.ply --environment overcst": ["overcst", "studio, overcast, sun"],
-    "render plate.ply --background environment --fill 0": ["--background", "no --environment"],
+    "render plate.ply --background environment --fill 0": ["--background", "no light is an"],
     "render plate.ply --environment map.png": ["map.png", "encoded for a display"],
     "render missing.ply --environment studio --light-azimuth 30": ["--light-azimuth", "--env"],
     "render missing.ply --fill -1": ["--fill", "-1"],
@@ -126,11 +124,18 @@ REFUSED = {
     "fit marble --error -1": ["--error", "-1"],
     "recover plate.ply missing.toml --output mine.exr": ["mine.exr"],
     "recover plate.ply missing.toml --output mine.toml --eta 0.9": ["--eta is 0.9"],
+    "recover plate.ply missing.toml --output mine.toml --count 0": ["--count is 0"],
     "recover plate.ply missing.toml --output mine.toml --start skin": ["[medium]"],
     "fit media.csv --all": ["--output"],
     "fit media.csv --all --output nowhere/fits.csv": ["no folder"],
     "fit media.csv --all --output fits.csv --count 9": ["--count is 9"],
     # Options that have no effect, or do not go together.
+    "render plate.ply --environment-rotation 40 --fill 1": ["--environment-rotation is 40"],
+    "render plate.ply --camera missing.json --fov 30": ["--fov is 30", "--camera"],
+    "render plate.ply --camera-unit 10": ["--camera-unit is 10"],
+    "render --up z": ["--up is z"],
+    "fit skin1 --photons 5": ["--photons is 5", "monte-carlo"],
+    "sample ball.obj --mm-per-unit 1 --material marble --output o.ply": ["--material", "--share"],
     "fit media.csv --all --output fits.csv --error 0.1": ["--error is 0.1", "--all"],
     "fit dot.csv --model monte-carlo": ["--model", "dot.csv"],
     "fit dot.csv --power 2": ["--power", "dot.csv"],
@@ -281,118 +286,3 @@ def test_the_remaining_time_does_not_count_what_is_compiled_first(monkeypatch, c
     expected = ["1 of 4", "2 of 4, 4 s left", "3 of 4, 2 s left", "4 of 4, 0 s left"]
     assert lines[:4] == [f"frames: {line}" for line in expected]
     assert lines[4:6] == ["more: 1 of 4", "more: 2 of 4, 4 s left"]
-
-
-COLORS = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "COLUMNS": "80", "LINES": "40"}
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-@pytest.fixture
-def console(monkeypatch):
-    """Return how to put a file with some variables in the place of stderr."""
-
-    def put(file, **variables):
-        for name in ("NO_COLOR", "FORCE_COLOR"):
-            monkeypatch.delenv(name, raising=False)
-        for name, value in (COLORS | variables).items():
-            monkeypatch.setenv(name, value)
-        console = Console(file=file, quiet="QUIET" in variables)
-        for module in (_terminal, _main):
-            monkeypatch.setattr(module, "CONSOLE", console)
-        return file
-
-    return put
-
-
-def test_a_preview_is_shown_while_the_picture_compiles_and_only_then(plain, console, tmp_path):
-    splats, output, size = ball(tmp_path / "ball.ply"), tmp_path / "ball.exr", ("--width", 16)
-    options = [*size, "--height", 24, "--material", "marble", "--no-scattering", "--output", output]
-    shown = []
-    for more in ([], [], ["--quiet"]):
-        file = console(Terminal())
-        assert run("render", splats, *options, *more) == 0
-        shown.append("▀" in file.getvalue())
-    assert shown == [True, False, False]
-    assert file.getvalue() == ""
-
-
-def test_a_preview_is_upright_and_lit_from_where_the_light_is():
-    lights = sj.DirectionalLight([-0.8, -0.6, -0.2], [1.0, 2.0, 3.0])
-    scene = sj.Scene(sphere(3000, jitter=0.0), lights, sj.load_material("marble"))
-    eye = view((0.0, 0.0, 40.0), size=32)
-    picture = np.asarray(rough_picture(scene, lights.samples(), eye, 0.0, 28))
-    red, _, blue = np.moveaxis(picture, 2, 0)
-    assert picture.shape == (28, 28, 3)
-    assert np.all(red[red > 0] < blue[red > 0])
-    assert np.mean(red[10:18, 10:18] > 0) > 0.6
-    assert red.max() < 256
-    assert np.all(red[:, :2] == 0)
-    assert red[:, 14:].sum() > 1.5 * red[:, :14].sum()
-    assert red[:14].sum() > 1.3 * red[14:].sum()
-
-
-FAR, AHEAD, DISK = [0, 0, 1e5], [0, 0, -3], 2e10 / np.pi
-
-
-@pytest.mark.parametrize(
-    "light",
-    [
-        sj.DirectionalLight(AHEAD, 2.0),
-        sj.PointLight(FAR, 2e10),
-        sj.scene.SpotLight(FAR, AHEAD, 2e10),
-        sj.GaussianBeam(FAR, AHEAD, 4e8 * np.pi, 1e8),
-        sj.scene.DiskLight(FAR, DISK, AHEAD, 1.0),
-        sj.scene.RectangleLight.facing(FAR, [0, 0, 0], 1.0, 1.0, 2e10),
-        sj.scene.SphereLight(FAR, DISK, 1.0),
-    ],
-)
-def test_a_preview_shows_every_kind_of_light(light):
-    scene, camera = sj.Scene(sphere(3000), light, sj.load_material("marble")), view((9, 9, 40))
-    samples = light.samples(), [sj.DirectionalLight([0, 0, -1], 2.0)]
-    pictures = [rough_picture(scene, sampled, camera, 0.0, 28) for sampled in samples]
-    assert np.abs(np.subtract(*pictures)).max() <= 1
-
-
-def test_a_preview_compiles_nothing(compiled):
-    """It is drawn while JAX compiles a program, which may be one that it would need."""
-    sampled, other = (sj.EnvironmentLight(np.ones((6, 12, 3)), count=count) for count in (16, 19))
-    camera, samples = view((0.0, 0.0, 40.0)), sampled.samples()
-    scene = sj.Scene(sphere(3000), other, sj.load_material("marble"))
-    before = len(compiled)
-    rough_picture(scene, samples, camera, 0.0, 28)
-    assert len(compiled) == before
-    other.samples()
-    assert len(compiled) > before
-
-
-def test_a_preview_that_fails_does_not_end_the_picture(console):
-    console(Terminal())
-    with _terminal.preview(mock.Mock(side_effect=AttributeError("direction"))):
-        jax.monitoring.record_event("/jax/compilation_cache/cache_misses")
-
-
-@pytest.mark.parametrize(
-    ("file", "variables", "shown"),
-    [
-        (Terminal, {}, True),
-        (Terminal, {"TERM": "xterm-256color", "COLORTERM": ""}, True),
-        (Terminal, {"NO_COLOR": "1"}, False),
-        (Terminal, {"TERM": "dumb"}, False),
-        (Terminal, {"QUIET": "1"}, False),
-        (io.StringIO, {"FORCE_COLOR": "1"}, False),
-    ],
-)
-def test_a_preview_is_for_terminals_with_colors(file, variables, shown, console):
-    file, sides = console(file(), **variables), []
-    with _terminal.preview(lambda side: sides.append(side) or [[(9, 9, 9)], [(0, 0, 0)]]):
-        jax.monitoring.record_event("/jax/compilation_cache/cache_hits")
-        assert sides == []
-        for _ in range(2):
-            jax.monitoring.record_event("/jax/compilation_cache/cache_misses")
-    jax.monitoring.record_event("/jax/compilation_cache/cache_misses")
-    assert sides == ([64] if shown else [])
-    assert file.getvalue().count("▀") == shown
