@@ -17,6 +17,7 @@ import splatjax as sj
 
 from ._terminal import note
 
+_OPAQUE = 4e-6  # mm^2, above the variance of `Material.opaque`
 _note_once = functools.cache(note)
 
 
@@ -100,8 +101,7 @@ def note_unresolved(frame: sj.Frame, scene: sj.Scene, kernel: Any, count: int) -
     """
     unresolved = np.asarray(frame.unresolved_fraction) > 0.5
     variances = np.asarray(scene.material.gaussians.variances)
-    is_opaque = np.max(variances) <= scene.material.opaque().gaussians.variances[0]
-    if is_opaque or not unresolved.any():
+    if np.max(variances) < _OPAQUE or not unresolved.any():
         return
     deviations = np.sqrt(variances)[unresolved]
     interval = np.asarray(kernel.interval(sj.diffusion.unevenness(scene.splats)))
