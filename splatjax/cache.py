@@ -54,6 +54,7 @@ _folder: Path | None = None
 _compiler_options: dict[str, bool | str] = {}
 _programs: dict[Path, Callable] = {}
 _capacities: dict[Hashable, list[int]] = {}
+_exclusive = threading.RLock()  # while settings of JAX are changed
 
 
 @contextmanager
@@ -192,7 +193,7 @@ def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
     def of_leaves(leaves):
         return function(*eqx.combine(jax.tree.unflatten(structure, leaves), static))
 
-    with ExitStack() as stack:
+    with _exclusive, ExitStack() as stack:
         # JAX's cache is off here: an executable that is read from it lacks kernels when serialized.
         stack.callback(jax.config.update, _LEAST_TIME, jax.config.values[_LEAST_TIME])
         jax.config.update(_LEAST_TIME, float("inf"))

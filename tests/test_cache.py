@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -88,6 +89,30 @@ def test_a_program_is_not_taken_out_of_the_cache_of_jax_to_be_kept(folder, event
         results_of_a_start()
         next(folder.glob("total-*")).unlink()
     assert "/jax/compilation_cache/cache_hits" not in events
+
+
+def test_threads_that_compile_at_once_leave_the_cache_of_jax_on():
+    inside, ended = threading.Event(), threading.Event()
+
+    @sj.cache.kept_jit
+    def first(values):
+        thread.start()
+        inside.wait(0.5)  # in vain, because the other waits for this one
+        return values
+
+    @sj.cache.kept_jit
+    def second(values):
+        inside.set()
+        ended.wait(5)
+        return values
+
+    name = "jax_persistent_cache_min_compile_time_secs"
+    before, values = jax.config.values[name], jnp.ones(2)
+    thread = threading.Thread(target=second, args=[values])
+    first(values)
+    ended.set()
+    thread.join()
+    assert jax.config.values[name] == before
 
 
 def test_every_value_and_every_shape_has_a_file_of_its_own(folder):
