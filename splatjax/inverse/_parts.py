@@ -19,7 +19,7 @@ from ._observation import PicturedScene
 
 # Least distance of initial values from 0 and 1, where logits are infinite.
 BOUNDED = 1e-3
-_PLACES = ("direction", "position", "origin")  # fields of lights
+_PLACES = ("direction", "position", "origin", "center")  # fields of lights
 
 # Coordinates of each part, as a tuple with one entry per picture if pictures do not share the part.
 Coordinates = tuple[PyTree[Array], ...]
@@ -139,8 +139,8 @@ class LightStrengths(AbstractPart):
 
 
 class LightPlaces(AbstractPart):
-    """The position or direction of each light in each picture. Directions rotate; point lights and
-    the origins of beams shift.
+    """The position or direction of each light in each picture. Directions rotate; point lights, the
+    origins of beams and the centers of area lights shift.
 
     **Attributes:** (static)
 
@@ -215,13 +215,19 @@ class MovableScene(eqx.Module):
         return cls(material, tuple(parts), tuple(part.prepared(splats) for part in parts))
 
     def start(self, pictured_scenes: Sequence[PicturedScene]) -> Coordinates:
-        """Return the initial coordinates, zeros."""
-        return tuple(
+        """Return the initial coordinates, zeros. Raise `ValueError` for a part that has none."""
+        start = tuple(
             part.coordinates(pictured_scenes[0])
             if part.shared
             else tuple(part.coordinates(pictured) for pictured in pictured_scenes)
             for part in self.parts
         )
+        for part, coordinates in zip(self.parts, start, strict=True):
+            name = type(part).__name__
+            require(
+                jax.tree.leaves(coordinates), f"parts: no picture has what {name} changes; omit it"
+            )
+        return start
 
     def of_picture(self, x: Coordinates, number: int) -> Coordinates:
         """Select the coordinates that a picture depends on."""

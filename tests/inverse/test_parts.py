@@ -220,18 +220,27 @@ def test_a_rotation_has_a_derivative_where_there_is_none():
 
 
 @pytest.mark.once
+def test_a_part_with_nothing_to_change_is_refused():
+    sky, parts = sj.EnvironmentLight(np.ones((4, 8, 1))), [sj.inverse.LightPlaces()]
+    seen = [sj.inverse.Observation(np.ones((4, 4, 2)), CAMERA, sky)]
+    fit = partial(sj.inverse.fit_scene, seen, sphere(20), material(), parts, OPTIMIZER, steps=1)
+    assert_refused(fit, "parts: .*LightPlaces")
+
+
+@pytest.mark.once
 def test_lights_move_each_in_its_own_way():
     beam = sj.GaussianBeam([1, 2, 3], [0, 0, -2], power=[4, 5], variance=1)
-    lights = sj.PointLight([1, 2, 3], intensity=[4, 5]), beam
+    ball = sj.scene.SphereLight([1, 2, 3], [4, 5], 1)
+    lights = sj.PointLight([1, 2, 3], intensity=[4, 5]), beam, ball
     pictured = PicturedScene(sphere(20), CAMERA, lights)
     places = sj.inverse.LightPlaces(turn=0.1, shift=2.0)
     x = jax.tree.map(jnp.ones_like, places.coordinates(pictured))
-    lamp, beam = places.moved(pictured, x, None).lights
-    np.testing.assert_allclose([lamp.position, beam.origin], [[3, 4, 5]] * 2)
+    lamp, beam, ball = places.moved(pictured, x, None).lights
+    np.testing.assert_allclose([lamp.position, beam.origin, ball.center], [[3, 4, 5]] * 3)
     turned = Rotation.from_rotvec([0.1, 0.1, 0.1]).apply([0, 0, -2])
     np.testing.assert_allclose(beam.direction, turned, rtol=1e-5)
-    x = (jnp.asarray([0.0, 1.0]), jnp.asarray([2.0, 0.0]))
-    lamp, beam = sj.inverse.LightStrengths(step=0.5).moved(pictured, x, None).lights
+    x = (jnp.asarray([0.0, 1.0]), jnp.asarray([2.0, 0.0]), jnp.zeros(2))
+    lamp, beam, _ = sj.inverse.LightStrengths(step=0.5).moved(pictured, x, None).lights
     expected = [[4, 5 * np.exp(0.5)], [4 * np.exp(1), 5]]
     np.testing.assert_allclose([lamp.intensity, beam.power], expected, rtol=1e-6)
 
