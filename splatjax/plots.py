@@ -113,7 +113,7 @@ def plot_fit(
             transform=residual.get_xaxis_transform(),
             fontsize="small",
         )
-        most = 1.3 * max(float(np.nanmax(np.abs(relative[radii >= begin]))), 1e-3)
+        most = 1.3 * float(np.nanmax(np.abs(relative[radii >= begin]), initial=1e-3))
         residual.set_ylim(-most, most)
     for axis in (log.xaxis, residual.xaxis):
         axis.set_minor_formatter(NullFormatter())  # their labels would overlap within a decade
@@ -199,7 +199,8 @@ def plot_pictures(
     )
     for number, (line, pictures) in enumerate(zip(grid, rows, strict=True)):
         values = np.stack([np.asarray(picture, np.float64) for picture in pictures])
-        brightest = np.quantile(values[values > 0], _BRIGHTEST) if white is None else white
+        lit = values[values > 0] if np.any(values > 0) else 1.0
+        brightest = np.quantile(lit, _BRIGHTEST) if white is None else white
         for axes, picture in zip(line, linear_to_srgb(values / brightest), strict=True):
             axes.imshow(picture, interpolation="nearest")
         if names is not None:

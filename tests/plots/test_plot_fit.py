@@ -6,7 +6,7 @@ import numpy as np
 from bodies import assert_refused
 
 import splatjax as sj
-from splatjax.plots import plot_error_by_count, plot_fit
+from splatjax.plots import plot_error_by_count, plot_fit, plot_pictures
 
 
 def test_a_figure_has_names_units_error_and_energy_and_is_drawn_outside_of_pyplot(
@@ -49,6 +49,13 @@ def test_what_was_not_fitted_is_shaded_and_not_counted():
         ]
         np.testing.assert_allclose(shade.get_x() + shade.get_width(), 0.5 / 2.6241, rtol=0.05)
     assert_refused(lambda: plot_fit(beam, gaussians), r"like 1/r.*rule=")
+
+
+def test_nothing_to_count_or_to_see_is_drawn_too():
+    fit, rule = sj.SumOfGaussians([1.0], [1.0]), sj.scattering.L2_QUADRATURE.beyond(200.0)
+    assert len(plot_fit(sj.Dipole(sj.Medium(0.1, 1.0, 1.3)), fit, rule=rule).axes) == 3
+    (axes,) = plot_pictures([[np.zeros((4, 4, 3))]], ["black"]).axes
+    assert not np.any(axes.images[0].get_array())
 
 
 def test_few_radii_are_marked_and_the_fit_is_drawn_between_them():
