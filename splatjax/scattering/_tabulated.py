@@ -122,7 +122,7 @@ class LaserDot(eqx.Module):
 
 
 def measure_laser_dot(
-    image: Float[np.ndarray, "height width channels"] | Float[Array, "height width channels"],
+    image: Float[np.ndarray, "height width *channels"] | Float[Array, "height width *channels"],
     mm_per_pixel: float,
     *,
     power: Numbers,
@@ -138,7 +138,7 @@ def measure_laser_dot(
 
     **Arguments:**
 
-    - `image`: linear radiance.
+    - `image`: linear radiance, of several channels or gray.
     - `mm_per_pixel`: width of a pixel on the surface, mm, positive.
     - `power`: power that enters the material, positive, one number or one per channel; in W if the
       image is in W/(mm^2 sr). The profile and its total reflectance are inversely proportional to
@@ -154,18 +154,20 @@ def measure_laser_dot(
     a profile is flat at its center. The standard error excludes the variation due to the slope
     across the ring. Rings of fewer than twelve pixels are merged with the next.
 
-    **Raises:** `ValueError` for pixels that are not finite, for a length or power that is not
-    positive, for a center outside the picture, and if fewer than two rings remain.
+    **Raises:** `ValueError` for pixels that are not finite or all black, for a length or power that
+    is not positive, for a center outside the picture, and if fewer than two rings remain.
     """
-    pixels = np.asarray(image, np.float64)
+    pixels = np.asarray(image, np.float64).reshape(*np.shape(image)[:2], -1)
     entering = np.broadcast_to(np.asarray(power, np.float64), pixels.shape[2:])
     check_values("image", pixels, "finite; crop such pixels", lambda x: x == x)
     check_values("mm_per_pixel", mm_per_pixel, "positive", lambda x: x > 0)
     check_values("power", entering, "positive", lambda x: x > 0)
+    check_values("largest", largest, "positive (mm)", lambda x: x > 0)
     check_values("step", step, "at least 1 pixel", lambda x: x >= 1 - 1e-9)
     height, width = pixels.shape[:2]
     y, x = np.mgrid[:height, :width] + 0.5
     light = pixels.sum(axis=2)
+    check_values("the brightest pixel of image", light.max(), "positive", lambda x: x > 0)
     core = np.where(light > _CORE * light.max(), light, 0.0)
     centroid = [float((core * coordinate).sum() / core.sum()) for coordinate in (x, y)]
     x0, y0 = centroid if center is None else center

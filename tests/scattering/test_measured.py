@@ -111,6 +111,12 @@ def test_power_and_pixel_scale_what_a_photograph_gives(float64):
     assert_close((other.radii, other.values), expected, rtol=1e-12)
 
 
+def test_a_gray_picture_has_one_channel(float64):
+    gray, colored = photograph()[..., 0], photograph()[..., :1]
+    dots = [measure_laser_dot(image, MM_PER_PIXEL, power=2.0) for image in (gray, colored)]
+    assert_close(*dots)
+
+
 @pytest.mark.once
 @pytest.mark.parametrize("center", [(20.5, 61.0), (60.0, 14.5), (98.0, 60.5), (61.5, 103.0)])
 def test_rings_end_at_the_nearest_edge(center):
@@ -149,6 +155,8 @@ def test_saturated_rings_are_left_out(float64):
         ({"mm_per_pixel": 0.0}, "mm_per_pixel must be positive"),
         ({"power": -1.0}, "power must be positive"),
         ({"power": np.asarray([2.0, -1.0])}, "power must be positive"),
+        ({"largest": -1.0}, "largest must be positive"),
+        ({"image": np.zeros((9, 9, 1))}, "brightest pixel of image must be positive"),
         ({"step": 0.5}, "step must be at least 1 pixel"),
         (
             {"saturation": 0.0},
