@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
+from splatjax._records import check_values
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import HalfSpace, Medium, diffuse_scaling
 from splatjax.scene import Material
@@ -149,7 +150,8 @@ def separable_kernel(
 
     **Returns:** the ascending offsets, mm, and their weights.
 
-    **Raises:** `ValueError` for an even number of samples, or fewer than 3.
+    **Raises:** `ValueError` for an even number of samples, or fewer than 3, and for a reach that is
+    not positive.
 
     **Source:** Jimenez et al. 2015, "Separable subsurface scattering", and its published code.
     """
@@ -157,6 +159,7 @@ def separable_kernel(
         raise ValueError(
             f"samples must be odd and at least 3, so that one is in the middle; got {samples}"
         )
+    check_values("reach", reach, "positive (mm)", lambda x: x > 0)
     squared = gaussians.variances @ gaussians.weights / gaussians.total_reflectance()
     farthest = 2 * jnp.sqrt(jnp.max(squared)) if reach is None else reach
     t = jnp.linspace(-1.0, 1.0, samples, dtype=gaussians.variances.dtype)

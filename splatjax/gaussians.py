@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import numbers, record, valid
+from splatjax._records import check_values, numbers, record, valid
 
 
 def gaussian(
@@ -113,8 +113,13 @@ class SumOfGaussians(AbstractProfile):
         return SumOfGaussians(self.variances + variance, self.weights)
 
     def white(self) -> "SumOfGaussians":
-        """Scale the weights of each channel to sum to 1."""
-        return SumOfGaussians(self.variances, self.weights / jnp.sum(self.weights, axis=0)[None])
+        """Scale the weights of each channel to sum to 1.
+
+        **Raises:** `ValueError` for a black channel.
+        """
+        total = self.total_reflectance()
+        check_values("total_reflectance", total, "positive, to be scaled to 1", lambda x: x > 0)
+        return SumOfGaussians(self.variances, self.weights / total[None])
 
 
 def pad_gaussians(gaussians: SumOfGaussians) -> SumOfGaussians:

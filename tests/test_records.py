@@ -222,6 +222,22 @@ def test_traced_values_and_placeholders_pass_through_transformations():
             lambda: sj.exports.separable_kernel(material().gaussians, 24),
             "samples must be odd and at least 3.*got 24",
         ),
+        (
+            lambda: sj.exports.separable_kernel(material().gaussians, reach=0.0),
+            "reach must be positive",
+        ),
+        (
+            lambda: sj.exports.data_sheet(sj.SumOfGaussians([1.0], [[0.5, 0.0]])),
+            r"total_reflectance must be positive.* 0 at \[1\]",
+        ),
+        (
+            lambda: sj.Material(sj.SumOfGaussians([1.0], [[0.5, 0.0]])).white(),
+            r"total_reflectance must be positive.* 0 at \[1\]",
+        ),
+        (
+            lambda: sj.inverse.Observation(np.ones((2, 2, 3), np.uint8), camera(), light()),
+            r"Observation\.picture has integer dtype",
+        ),
         (lambda: bust_with_textures(0), "texels is 0"),
         (
             lambda: sj.geometry.complete_splats(np.concatenate([np.eye(3)] * 4)),
@@ -295,6 +311,12 @@ def test_an_object_of_another_kind_is_refused_by_name(make, name):
     """By splatjax, or by the type checker of the tests."""
     with pytest.raises((ValueError, TypeError), match=name):
         make()
+
+
+def test_a_mask_has_no_channels():
+    mask = np.ones((2, 2, 3), bool)
+    with pytest.raises(ValueError, match=r"mask has 2 x 2 x 3 pixels"):
+        sj.inverse.Observation(np.ones((2, 2, 3)), camera(), light(), mask)
 
 
 def test_without_maps_the_material_alone_gives_the_surface():

@@ -66,7 +66,7 @@ class Observation(eqx.Module):
 
     **Attributes:**
 
-    - `picture`: radiance, like `Frame.beauty`; NaN where a pixel is unknown.
+    - `picture`: linear radiance, like `Frame.beauty`; NaN where a pixel is unknown.
     - `camera`: the camera, with as many pixels as the picture.
     - `lights`: all lights of the picture.
     - `mask`: the pixels that count; `None` for all. Pixels that the body does not fill count only
@@ -80,7 +80,9 @@ class Observation(eqx.Module):
     camera, and for deviations that are not positive.
     """
 
-    picture: Float[Array, "height width channels"] = eqx.field(converter=numbers)
+    picture: Float[Array, "height width channels"] = eqx.field(
+        converter=numbers, metadata={"linear": True}
+    )
     camera: Camera
     lights: tuple[AbstractLight, ...] = eqx.field(converter=several)
     mask: Bool[Array, "height width"] | None = eqx.field(
@@ -93,12 +95,12 @@ class Observation(eqx.Module):
 
     def __check_init__(self):
         size = self.camera.height, self.camera.width
-        for name in ("picture", "mask"):
-            pixels = np.shape(getattr(self, name))[:2] or size  # there may be no mask
+        sizes = {"picture": np.shape(self.picture)[:2] or size, "mask": np.shape(self.mask) or size}
+        for name, pixels in sizes.items():
             require(
                 pixels == size,
-                f"Observation.{name} has {pixels[0]} x {pixels[1]} pixels, its camera {size[0]} x "
-                f"{size[1]} (height, width)",
+                f"Observation.{name} has {' x '.join(map(str, pixels))} pixels, its camera "
+                f"{size[0]} x {size[1]} (height, width)",
             )
 
 

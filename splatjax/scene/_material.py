@@ -172,8 +172,11 @@ class Material(eqx.Module):
     def white(self) -> "Material":
         """Scale the total reflectance to 1 per channel, so that an albedo map alone gives the
         color.
+
+        **Raises:** `ValueError` for a black channel.
         """
         total, single = self.total_reflectance(), self.single_scattering
+        check_values("total_reflectance", total, "positive, to be scaled to 1", lambda x: x > 0)
         gaussians = SumOfGaussians(self.gaussians.variances, self.gaussians.weights / total[None])
         if single is not None:
             single = SingleScattering(single.medium, single.strength / total)
