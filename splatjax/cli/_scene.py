@@ -148,7 +148,7 @@ def rough_picture(
 def _irradiance(light: Any, splats: sj.Splats) -> np.ndarray:
     """Compute the irradiance of splats by a sample of a light, without shadows, by NumPy."""
     strength = getattr(light, light.strength_field)
-    axis = getattr(light, "direction", getattr(light, "normal", None))
+    axis: Any = getattr(light, "direction", getattr(light, "normal", None))
     offset = splats.centers - getattr(light, "position", getattr(light, "origin", 0.0))
     squared = np.maximum(np.sum(offset**2, axis=1, keepdims=True), 1e-12)
     path, cosine = offset / np.sqrt(squared), 1.0

@@ -95,8 +95,8 @@ class Observation(eqx.Module):
 
     def __check_init__(self):
         size = self.camera.height, self.camera.width
-        sizes = {"picture": np.shape(self.picture)[:2] or size, "mask": np.shape(self.mask) or size}
-        for name, pixels in sizes.items():
+        mask = getattr(self.mask, "shape", size)
+        for name, pixels in (("picture", np.shape(self.picture)[:2] or size), ("mask", mask)):
             require(
                 pixels == size,
                 f"Observation.{name} has {' x '.join(map(str, pixels))} pixels, its camera "
