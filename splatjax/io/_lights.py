@@ -39,8 +39,7 @@ from ._images import read_picture
 from ._tables import Table, read_toml
 from ._trimesh import one_sentence
 
-PLACE = ("position", "target", "up", "fov")
-_UPRIGHT = None, None, [0.0, 1.0, 0.0]  # defaults of the vectors in PLACE
+PLACE = {"position", "target", "up", "fov", "near"}
 _MOST_ROWS = 512  # largest number of rows of an environment
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
 ENVIRONMENTS = {"studio": studio, "overcast": overcast_sky, "sun": sun_and_sky}
@@ -142,14 +141,15 @@ def read_observations(path: StrPath) -> list[Observation]:
         direction = [1, -0.3, -0.5]
         irradiance = [3.14, 3.14, 3.14]
 
-    A camera may have `up`. Other kinds of lights are "point" (`position` in mm, `intensity`,
-    `cast_shadows`), "spot" (a point light with `direction`, `inner_angle` and `outer_angle` in
-    degrees), "beam" (`origin`, `direction`, `power`, `variance` in mm^2), "rectangle" (`center`,
-    `radiance`, `edges`), "disk" (`center`, `radiance`, `direction`, `radius`), "sphere" (`center`,
-    `radiance`, `radius`; all three `cast_shadows`) and "environment" (`image`: studio, overcast,
-    sun, or a file; `rotation`, `strength`, `up`). Instead of `direction`, a spot, beam or disk may
-    have a `target`, the point that it faces; instead of `edges`, a rectangle may have `target`,
-    `width` and `height`. A color is one number per channel, or one for all.
+    A camera may have `up` and `near` (mm). Other kinds of lights are "point" (`position` in mm,
+    `intensity`, `cast_shadows`), "spot" (a point light with `direction`, `inner_angle` and
+    `outer_angle` in degrees), "beam" (`origin`, `direction`, `power`, `variance` in mm^2),
+    "rectangle" (`center`, `radiance`, `edges`), "disk" (`center`, `radiance`, `direction`,
+    `radius`), "sphere" (`center`, `radiance`, `radius`; all three `cast_shadows`) and "environment"
+    (`image`: studio, overcast, sun, or a file; `rotation`, `strength`, `up`). Instead of
+    `direction`, a spot, beam or disk may have a `target`, the point that it faces; instead of
+    `edges`, a rectangle may have `target`, `width` and `height`. A color is one number per channel,
+    or one for all.
 
     **Returns:** an `Observation` for each picture, in JAX's default precision.
 
@@ -203,12 +203,13 @@ def _observation(table: Table) -> Observation:
 
 def look_at(table: Table, width: int, height: int) -> Camera:
     """Make a camera from a table with position, target, up and field of view."""
-    vectors = [table.numbers(n, d).tolist() for n, d in zip(PLACE, _UPRIGHT, strict=False)]
-    for name, vector in zip(PLACE, vectors, strict=False):
-        table.expect(np.shape(vector) == (3,), f"{name} must be three numbers; it is {vector}")
-    *points, up = vectors
+    lens = {name: table.number(name) for name in ("fov", "near") if name in table.entries}
     return table.make(
-        Camera.look_at, *points, up=up, fov=table.number("fov", 25.0), width=width, height=height
+        Camera.look_at,
+        table.vector("position"),
+        table.vector("target"),
+        up=table.vector("up", [0.0, 1.0, 0.0]),
+        **{"fov": 25.0, "width": width, "height": height} | lens,
     )
 
 
@@ -233,27 +234,28 @@ def plain_light(light: AbstractLight, image: str) -> dict[str, Any]:
 
 
 def light_of(table: Table, channels: int, in_gray: bool = False) -> AbstractLight:
-    """Make a light with the channels of a picture from a table. `in_gray` converts its image to
-    gray.
+    """Make a light with the channels of a picture from a table. `in_gray`, or one channel, converts
+    its image to gray.
     """
     light = _LIGHTS[table.one_of("kind", _LIGHTS)]
     names, given = {"kind", *record_names(light)}, dict[str, Any]()
     if "target" in table.entries and light in _AIMED:
         place, aim = _AIMED[light]
-        center, target = table.numbers(place), table.numbers("target")
+        center, target = table.vector(place), table.vector("target")
         given[aim] = target - center
         names = names - {aim} | {"target"}
         if light is RectangleLight:
             names |= _FACING
             size = table.number("width"), table.number("height")
             given[aim] = table.make(RectangleLight.facing, center, target, *size, 1.0).edges
-    table = Table(table.path, table.name, table.entries, names)
+    table = table.only(names)
     if light is EnvironmentLight:
         image = _environment_image(table)
+        in_gray = in_gray or channels == 1
         given["image"] = image.mean(axis=-1, keepdims=True) if in_gray else image
         count = table.entries.get("directions")
         if not isinstance(count, list | None):
-            given["directions"] = even_directions(int(table.number("directions")))
+            given["directions"] = even_directions(table.whole("directions"))
     strength = table.numbers(light.strength_field, 1.0)
     table.make(check_values, light.strength_field, strength, "at least 0", lambda x: x >= 0)
     table.expect(

@@ -31,8 +31,17 @@ DIFFUSERS = {
 }
 _TABLES = ("material", "splats", "camera", "lights", "settings")
 _MAPS = ("albedo", "normal", "specular")
-_BODY = ("file", "mesh", "bust", "count", "mm_per_unit", "up", "scale", "v_up", *_MAPS)
-_CAMERA = {*PLACE, *record_names(Camera), "file", "name", "mm_per_unit"}
+# Entries of [splats] for each kind of body, and of [camera] for each kind of camera.
+_BODIES = {
+    "bust": {"bust", "up", "scale", "albedo"},
+    "mesh": {"mesh", "count", "mm_per_unit", "up", "scale", "v_up", *_MAPS},
+    "file": {"file", "mm_per_unit", "up", "scale", "albedo"},
+}
+_CAMERAS = {
+    "file": {"file", "name", "mm_per_unit", "up", "height"},
+    "target": {*PLACE, "width", "height"},
+    "rotation": {*record_names(Camera)},
+}
 
 
 def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
@@ -44,7 +53,7 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
                                      # a mesh may have albedo = "color.jpg", normal, specular, v_up
         up = "y"                     # optional, as are scale = 1.0 and albedo = true
         [camera]
-        position = [0, 0, 620]       # mm; target, up, and the vertical fov in degrees
+        position = [0, 0, 620]       # mm; target, up, near, and the vertical fov in degrees
         target = [0, -40, 0]
         fov = 25
         width = 512
@@ -57,9 +66,10 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
         diffusion = "clusters"       # exitance or shape
 
     `read_observations` lists the entries of the other lights. A camera may instead have `position`,
-    `rotation`, `focal_length` and `principal_point`, or `file`, `name` and `mm_per_unit`
-    (`load_cameras`). If the splats have an albedo, the weights of a material given by name or file
-    are divided by their sums, as on the command line.
+    `rotation`, `focal_length` and `principal_point`, or `file`, `name`, `mm_per_unit` and `up`
+    (`load_cameras`); the position of a camera from a file is scaled with the splats. If the splats
+    have an albedo, the weights of a material given by name or file are divided by their sums, as on
+    the command line.
 
     **Arguments:** `path`: a TOML file, or a picture that the command line rendered.
 
@@ -67,7 +77,8 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
     for a missing file.
     """
     file = scene_table(path)
-    splats = _splats(file.table("splats", _BODY))
+    body = file.table_of_kind("splats", _BODIES)
+    splats = _splats(body)
     source = material_of_scene(file)
     if isinstance(source, Table):
         material = load_material(source)
@@ -82,16 +93,17 @@ def load_scene(path: StrPath) -> tuple[Scene, Camera, RenderSettings]:
     )
     lights = [
         light_of(light, material.channels, material.wavelengths is not None)
-        for light in file.tables("lights", LIGHT_ENTRIES)
+        for light in file.tables("lights", LIGHT_ENTRIES, least=0)
     ]
     table = file.table("settings", ("bounces", "diffusion"))
     settings = table.make(
         RenderSettings,
         diffuser=DIFFUSERS[table.one_of("diffusion", DIFFUSERS, "clusters")],
-        bounces=int(table.number("bounces", 0.0)),
+        bounces=table.whole("bounces", 0.0),
     )
     scene = file.make(Scene, splats, lights, material)
-    return scene, _camera(file.table("camera", _CAMERA)), settings
+    camera = _camera(file.table_of_kind("camera", _CAMERAS), body.number("scale", 1.0))
+    return scene, camera, settings
 
 
 def scene_table(path: StrPath) -> Table:
@@ -137,14 +149,14 @@ def material_of_scene(file: Table) -> StrPath | Table:
 
 def mesh_of_scene(file: Table) -> Mesh | None:
     """Return the mesh (mm) from which the splats of a scene file are sampled, or `None`."""
-    table = file.table("splats", _BODY)
-    if "file" in table.entries:
-        return None
+    table = file.table_of_kind("splats", _BODIES)
     if "bust" in table.entries:
         mesh = bust_mesh()
-    else:
+    elif "mesh" in table.entries:
         path, unit = _body(table)
         mesh, _ = read_textured_mesh(path, **unit)
+    else:
+        return None
     return replace(mesh, vertices=table.number("scale", 1.0) * mesh.vertices)
 
 
@@ -178,9 +190,10 @@ def save_scene(
         lights.append(plain_light(light, image.name))
         if isinstance(light, EnvironmentLight):
             expect(
-                scene.material.wavelengths is None or light.image.shape[-1] == 1,
+                light.image.shape[-1] in ((1, 3) if scene.material.wavelengths is None else (1,)),
                 path,
-                "cannot store a spectral environment; give a gray image of one channel",
+                f"cannot store an environment of {light.image.shape[-1]} channels; give a gray "
+                "image of one channel (or, without wavelengths, one of red, green and blue)",
             )
             write_image(image, light.image)
     write_splats(path.with_suffix(".ply"), scene.splats)
@@ -209,15 +222,17 @@ def plain_scene(
 
 
 def _splats(table: Table) -> Splats:
+    has_map = "mesh" in table.entries and isinstance(table.entries.get("albedo"), str)
+    albedo = has_map or table.one_of("albedo", (True, False), True)
     if "bust" in table.entries:
-        splats = bust(int(table.number("bust")))
+        table.one_of("up", ("y",), "y")
+        splats = bust(table.whole("bust"))
     else:
-        count, (body, unit) = int(table.number("count", 200_000.0)), _body(table)
+        count, (body, unit) = table.whole("count", 200_000.0), _body(table)
         is_mesh = "mesh" in table.entries
         splats = sample_mesh(body, count, **unit) if is_mesh else read_splats(body, **unit)
-    scale, has_map = table.number("scale", 1.0), isinstance(table.entries.get("albedo"), str)
-    albedo = has_map or table.one_of("albedo", (True, False), True)
-    splats = splats if scale == 1 else splats.scaled(scale)
+    scale = table.number("scale", 1.0)
+    splats = splats if scale == 1 else table.make(splats.scaled, scale)
     return splats if albedo else splats.without_maps()
 
 
@@ -232,17 +247,19 @@ def _body(table: Table) -> tuple[Path, dict[str, Any]]:
         for name in _MAPS
         if not isinstance(table.entries.get(name, True), bool)
     }
-    table.expect(is_mesh or not maps, f"{', '.join(maps)}: maps are only for a mesh")
     return path, {"mm_per_unit": unit, "up": table.entries.get("up", "y"), **maps}
 
 
-def _camera(table: Table) -> Camera:
-    entries, height = table.entries, int(table.number("height", 512.0))
+def _camera(table: Table, scale: float) -> Camera:
+    """Make a camera. That of a file is scaled with the body."""
+    entries, height = table.entries, table.whole("height", 512.0)
     if "file" in entries:
         file, name = table.folder / table.text("file"), str(entries.get("name", "0"))
-        camera = load_camera(file, name, mm_per_unit=table.number("mm_per_unit"))
+        unit = {"mm_per_unit": table.number("mm_per_unit"), "up": entries.get("up", "y")}
+        camera = load_camera(file, name, **unit)
+        camera = replace(camera, position=camera.position * scale)
         return resized(camera, height) if "height" in entries else camera
-    width = int(table.number("width", float(height)))
+    width = table.whole("width", float(height))
     if "target" in entries:
         return look_at(table, width, height)
     return table.record(Camera, width=width, height=height)

@@ -56,11 +56,22 @@ class Table:
     def table(self, name: str, names: Iterable[str]) -> "Table":
         return Table(self.path, f"{self.name} {name}".strip(), self.entries.get(name), names)
 
-    def tables(self, name: str, names: Iterable[str]) -> "list[Table]":
+    def only(self, names: Iterable[str]) -> "Table":
+        return Table(self.path, self.name, self.entries, names)
+
+    def table_of_kind(self, name: str, kinds: Mapping[str, set[str]]) -> "Table":
+        """Return a table within this one. The first entry of `kinds` that it has, or the last,
+        determines which other entries it may have.
+        """
+        table = self.table(name, set().union(*kinds.values()))
+        return table.only(kinds[next((k for k in kinds if k in table.entries), [*kinds][-1])])
+
+    def tables(self, name: str, names: Iterable[str], least: int = 1) -> "list[Table]":
         """Return a list of tables within this one. Errors number them from 1."""
         value = self.entries.get(name)
         self.expect(
-            isinstance(value, list) and value, f"{name} must be one table or more; it is {value!r}"
+            isinstance(value, list) and len(value) >= least,
+            f"{name} must be one table or more; it is {value!r}",
         )
         return [
             Table(self.path, f"{self.name} {name} {number}".strip(), entries, names)
@@ -104,6 +115,16 @@ class Table:
         self.expect(values.ndim == 0, f"{name} must be one number; it is {values.tolist()}")
         return float(values)
 
+    def whole(self, name: str, default: float | None = None) -> int:
+        value = self.number(name, default)
+        self.expect(value.is_integer(), f"{name} must be a whole number; it is {value:g}")
+        return int(value)
+
+    def vector(self, name: str, default: list[float] | None = None) -> Array:
+        values = self.numbers(name, default)
+        self.expect(values.shape == (3,), f"{name} must be three numbers; it is {values.tolist()}")
+        return values
+
     def text(self, name: str) -> str:
         value = self.entries.get(name)
         self.expect(isinstance(value, str), f"{name} must be a name in quotes; it is {value!r}")
@@ -128,9 +149,9 @@ class Table:
         """Read the entry of a field of a given type: a Boolean, a number, or numbers."""
         if kind is bool:
             return self.one_of(name, (True, False))
-        if kind in (int, float):
-            return kind(self.number(name))
-        is_scalar = getattr(kind, "dim_str", None) == ""
+        if kind is int:
+            return self.whole(name)
+        is_scalar = kind is float or getattr(kind, "dim_str", None) == ""
         return self.number(name) if is_scalar else self.numbers(name)
 
 
@@ -164,7 +185,7 @@ def rounded(values: Any) -> np.ndarray:
 
 
 # Units of length in the column names of a table.
-_MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
+_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "µm": 1e-3, "inch": 25.4}
 _COLUMNS = "sigma_a", "sigma_s_prime", "eta"
 
 
@@ -223,10 +244,10 @@ def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
 
     **Raises:** `FileNotFoundError`; `ValueError`, with line and cause, for invalid content.
     """
-    contents = f"media are a CSV of {', '.join(_COLUMNS)}"
+    contents = f"media are a CSV of {', '.join(_COLUMNS)}, and optionally name"
     (_, head), *rows = _read_rows(path, contents) or [("", [])]
     expect(
-        set(head) >= set(_COLUMNS) and rows,
+        {*_COLUMNS} <= {*head} <= {*_COLUMNS, "name"} and rows,
         path,
         f"has the columns {', '.join(head)}, with {len(rows)} rows; {contents}",
     )

@@ -216,7 +216,10 @@ class Splats(eqx.Module):
     def scaled(self, factor: Float[Array, ""] | float) -> "Splats":
         """Scale the body about the origin. The distance that light travels in the material is
         unchanged, so a smaller body is more translucent.
+
+        **Raises:** `ValueError` for a factor that is not positive.
         """
+        check_values("the scale", factor, "positive", lambda x: x > 0)
         return eqx.tree_at(
             lambda body: (body.centers, body.radii, body.areas),
             self,

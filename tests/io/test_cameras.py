@@ -215,6 +215,11 @@ rotation = 20
 """
 
 
+BODY, FILE = BY_HAND[BY_HAND.index("mesh") :].split("\n[camera]\n")
+FILE = FILE[: FILE.index("height")]
+SPOT = 'kind = "spot"\nposition = [9, 9, 9]\nintensity = 1\ntarget = '
+
+
 def test_a_scene_comes_back_from_its_file_and_from_a_manifest(tmp_path):
     """With every light; in single precision for splats and environments."""
     lights = (
@@ -247,8 +252,13 @@ def test_a_scene_comes_back_from_its_file_and_from_a_manifest(tmp_path):
     plain = replace(SHAPE, kernel=sj.diffusion.PlainMean())
     write = partial(save_scene, tmp_path / "a.toml")
     assert_refused(partial(write, scene, camera, plain), r"a\.toml: stores only bounces")
-    harmonic = replace(scene, lights=sj.scene.HarmonicLight(np.zeros((9, 3))))
-    assert_refused(partial(write, harmonic, camera), "cannot store a HarmonicLight")
+    for light, value in (
+        (sj.scene.HarmonicLight(np.zeros((9, 3))), "cannot store a HarmonicLight"),
+        (sj.EnvironmentLight(np.zeros((4, 8, 5)), strength=np.ones(5)), r"a\.toml: .* 5 channels"),
+    ):
+        assert_refused(partial(write, replace(scene, lights=light), camera), value)
+    save_scene(tmp_path / "dark.toml", replace(scene, lights=()), camera)
+    assert load_scene(tmp_path / "dark.toml")[0].lights == ()
 
 
 @pytest.fixture
@@ -266,8 +276,14 @@ def test_a_scene_by_hand_names_files_beside_it(by_hand):
     sky = sj.EnvironmentLight(sj.scene.overcast_sky(), 20, [1, 1, 1])
     expected = sj.load_material("marble"), (sky,), sj.RenderSettings()
     assert eqx.tree_equal((scene.material, scene.lights, settings), expected)
-    expected = load_cameras(by_hand.with_name("cameras") / "colmap", mm_per_unit=2.0)["left 1.png"]
-    assert eqx.tree_equal(camera, replace(expected, width=320, height=240), **CLOSE)
+    cameras = partial(load_cameras, by_hand.with_name("cameras") / "colmap")
+    expected = replace(cameras(mm_per_unit=2.0)["left 1.png"], width=320, height=240)
+    assert eqx.tree_equal(camera, expected, **CLOSE)
+    text = BY_HAND.replace("height = 240", 'up = "z"').replace("count", "scale = 0.5\ncount")
+    _, camera, _ = load_scene(write_any(by_hand, text.replace('"marble"', '"marble_gems"')))
+    assert eqx.tree_equal(camera, cameras(mm_per_unit=1.0, up="z")["left 1.png"], **CLOSE)
+    near = text.replace(FILE, "near = 60\nposition = [0, 0, 90]\ntarget = [0, 1, 0]\n")
+    assert load_scene(write_any(by_hand, near.replace('up = "z"\n[[', "[[")))[1].near == 60
 
 
 def test_a_mesh_of_a_scene_has_maps(by_hand):
@@ -352,19 +368,25 @@ def test_lights_may_face_a_target(by_hand, tmp_path):
         ("mm_per_unit = 10", "", "[splats] mm_per_unit"),
         ("count = 60", "count = 60\nscale = true", "[splats] scale"),
         ('"left 1.png"', '"7"', "has no camera '7'; give one of its 3 names"),
-        ('file = "cameras/colmap"\nname', "position = [0, 0, 9]\nname", "[camera] rotation"),
+        (FILE, "position = [0, 0, 9]\n", "[camera] rotation"),
         ('"overcast"', '"fog.exr"', "fog.exr"),
         ("[[lights]]", "[settings]\nbounces = -1\n[[lights]]", "[settings]"),
         ("[[lights]]", '[settings]\ndiffusion = "dipole"\n[[lights]]', "diffusion must be"),
-        ("count = 60", "count = 60\nalbedo = 1", "albedo must be a name in quotes; it is 1"),
+        ("count = 60", "count = 60\nalbedo = 1", "albedo must be true or false; it is 1"),
         ("count = 60", 'count = 60\nnormal = "none.png"', "none.png"),
-        ("mesh =", "v_up = true\nfile =", "[splats] v_up: maps are only for a mesh"),
+        ("mesh =", "file =", "[splats] has an unknown entry 'count'"),
+        ("mesh =", "bust = 60\nmesh =", "[splats] has an unknown entry 'count'"),
+        (BODY, 'bust = 60\nup = "z"', "[splats] up must be 'y'; it is 'z'"),
+        (BODY, 'bust = 60\nalbedo = "a.png"', "[splats] albedo must be true or false"),
+        ("count = 60", "count = 60.9", "[splats] count must be a whole number; it is 60.9"),
+        ("count = 60", "count = inf", "[splats] count must be a whole number; it is inf"),
+        ("height = 240", "height = 24.5", "[camera] height must be a whole number; it is 24.5"),
+        ("count = 60", "count = 60\nscale = -1", "[splats]: the scale must be positive; got -1"),
+        ("height = 240", "fov = 30", "[camera] has an unknown entry 'fov'"),
+        ("[[lights]]", "[settings]\nbounces = 0.9\n[[lights]]", "bounces must be a whole number"),
+        ("[[lights]]", f"[[lights]]\n{SPOT}[1, 2]\n[[lights]]", "target must be three numbers"),
         ('"overcast"', '"overcst"', "did you mean 'overcast'"),
-        (
-            'file = "cameras/colmap"\nname',
-            "position = [0, 9]\ntarget = 0\nname",
-            "position must be",
-        ),
+        (FILE, "position = [0, 9]\ntarget = 0\n", "position must be"),
         ("[[lights]]", "[lights]", "lights must be one table or more"),
     ],
 )
