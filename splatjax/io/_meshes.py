@@ -75,7 +75,7 @@ def sample_mesh(
     - `mm_per_unit`: length of the file's unit, mm. glTF prescribes meters (1000), but many scans
       ignore this.
     - `albedo`: a picture, sRGB for integers and linear for floating-point numbers. `None`: the base
-      color textures of the file, if any.
+      colors of the file, unless all its parts have the same, without textures and vertex colors.
     - `specular`: a gray picture, not decoded: factor of the material's specular strength.
     - `normal`: a tangent-space normal map, not decoded; green points up.
     - `parameters`: parameters of the material by name, such as melanin. Each is a gray picture, not
@@ -234,8 +234,9 @@ def _piece(table: dict[str, Any], kind: str, columns: dict[str, Any]) -> Piece:
         material = visual.material
         image = getattr(material, "image", getattr(material, "baseColorTexture", None))
         texture = image.fp.getvalue() if hasattr(image, "fp") else None
-        # Exporters write a gray Kd together with a map.
-        plain = {} if texture else getattr(material, "kwargs", {})
+        colors = visual.vertex_attributes.get("color") if colors is None else colors
+        # Exporters write a gray Kd together with a map or vertex colors.
+        plain = {} if texture or colors is not None else getattr(material, "kwargs", {})
         factor = getattr(material, "baseColorFactor", None)
         color = color * plain.get("kd", 1.0) if factor is None else factor[:3] / 255
     wedges = columns.get("face", {}).get("texcoord")
@@ -308,8 +309,8 @@ def _joined(pieces: Sequence[Piece], mm_per_unit: float, flip_v: bool) -> Mesh:
 
 
 def _own_albedo(path: Path, pieces: Sequence[Piece]) -> np.ndarray | tuple[np.ndarray, ...] | None:
-    """Decode the textures of pieces, and multiply them by the material colors; `None` if no piece
-    has a texture.
+    """Decode the textures of pieces, and multiply them by the material colors; `None` for pieces of
+    one color without textures and vertex colors.
     """
     pictures = {None: np.ones((1, 1, 3))}
     with naming(path), TemporaryDirectory() as folder:
@@ -317,4 +318,7 @@ def _own_albedo(path: Path, pieces: Sequence[Piece]) -> np.ndarray | tuple[np.nd
             (file := Path(folder, "texture")).write_bytes(encoded)
             pictures[encoded] = read_color(file)
     maps = tuple(pictures[piece.texture] * piece.color for piece in pieces)
-    return None if len(pictures) == 1 else maps if len(maps) > 1 else maps[0]
+    is_varied = len(pictures) > 1 or np.ptp([piece.color for piece in pieces], axis=0).any()
+    if not is_varied and all(np.isnan(piece.mesh.colors).all() for piece in pieces):
+        return None
+    return maps if len(maps) > 1 else maps[0]

@@ -127,6 +127,27 @@ def test_scenes_keep_their_places_and_their_textures(tmp_path):
     np.testing.assert_allclose([colors[i] for i in range(3)], expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("texture", [None, Image.new("RGB", (4, 4), (255, 255, 255))])
+def test_colors_of_vertices_beside_a_material_of_gltf(tmp_path, texture):
+    """Multiplied by its color; one color alone is left to the material, and two are an albedo."""
+    vertices, faces, _, colors = with_attributes("ball")
+
+    def ball(blue, **attributes):
+        look = {"baseColorTexture": texture, "baseColorFactor": [255, 255, blue, 255]}
+        material = trimesh.visual.material.PBRMaterial(**look)
+        visual = trimesh.visual.TextureVisuals(uv=vertices[:, :2], material=material)
+        visual.vertex_attributes.update(attributes)
+        return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+
+    path = export(ball(0, color=np.insert(colors, 3, 255, axis=1)), tmp_path, "glb")
+    _, textures = compare(path, vertices, faces, colors=colors / 255)
+    np.testing.assert_array_equal(textures.albedo[0, 0], [1, 1, 0])
+    for blue, count in ((0, texture and 2), (255, 2)):
+        path = export(trimesh.Scene([ball(0), ball(blue)]), tmp_path, "glb")
+        albedo = sj.io.read_textured_mesh(path, mm_per_unit=MM)[1].albedo
+        assert (albedo and len(albedo)) == count
+
+
 CUBE = [[0, 0, 0], [0, 0, 1], [0, 1, 1], [0, 1, 0], [1, 0, 0], [1, 0, 1], [1, 1, 1], [1, 1, 0]]
 QUADS = [[0, 1, 2, 3], [7, 6, 5, 4], [0, 4, 5, 1], [1, 5, 6, 2], [2, 6, 7, 3], [3, 7, 4, 0]]
 ROWS = "\n".join(" ".join(map(str, row)) for row in CUBE)
