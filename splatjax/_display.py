@@ -25,10 +25,16 @@ def to_display(
 ) -> UInt8[np.ndarray, "height width channels"]:
     """Encode linear values of 1, 3 or 4 channels, as `splatjax.write_png` describes them.
 
-    **Raises:** `ValueError` for another number of channels or an exposure that is not finite.
+    **Raises:** `ValueError` for another number of axes or channels, for integers, and for an
+    exposure that is not finite.
     """
-    values = np.asarray(values, np.float64)
-    channels = values.shape[-1]
+    values = np.asarray(values)
+    if values.ndim != 3 or values.dtype.kind != "f":
+        raise ValueError(
+            f"a picture of shape {values.shape} and dtype {values.dtype} cannot be shown; give "
+            "linear light, floating-point numbers [height, width, channels]"
+        )
+    values, channels = values.astype(np.float64), values.shape[-1]
     if channels not in (1, 3, 4):
         raise ValueError(
             f"a picture of {channels} channels cannot be shown; give 1, 3 or 4, or the wavelengths "

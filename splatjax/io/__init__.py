@@ -5,6 +5,7 @@ from splatjax._display import (
     srgb_to_linear as srgb_to_linear,
 )
 
+from ._animations import write_animation as write_animation
 from ._files import (
     atomic_path as atomic_path,
     fingerprint as fingerprint,
@@ -16,7 +17,6 @@ from ._files import (
 from ._images import (
     read_exr as read_exr,
     read_picture as read_picture,
-    write_animation as write_animation,
     write_exr as write_exr,
     write_png as write_png,
 )

@@ -52,7 +52,8 @@ def naming(where: StrPath) -> Generator[None, None, None]:
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
-        raise type(error)(f"{where}: {error}") from None
+        kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
+        raise kind(f"{where}: {error}") from None
 
 
 def check_units(path: StrPath, mm_per_unit: float, up: str = "y") -> None:

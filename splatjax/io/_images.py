@@ -1,5 +1,5 @@
-"""Reading of pictures in all formats of OpenImageIO, with row 0 at the top; writing of PNG and WebP
-for displays, and of frames with all layers as OpenEXR.
+"""Reading of pictures in all formats of OpenImageIO, with row 0 at the top; writing of PNG for
+displays, and of frames with all layers as OpenEXR.
 """
 
 import errno
@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import OpenEXR  # ty: ignore[import-not-found]
 from jaxtyping import Array, Float
-from PIL import Image
 
 from splatjax._display import png_of, srgb_to_linear, to_display
 from splatjax._memory import check_memory
@@ -23,6 +22,8 @@ from ._files import StrPath, atomic_path, check_suffix, existing_file, expect, n
 from ._spectra import SPECTRAL, channel_names, picture_to_rgb
 
 MANIFEST = "splatjax.manifest"  # header attribute with the settings of a picture
+_REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+_CHROMATICITY = 1e-3  # tolerance
 _BYTES_PER_VALUE = 24.0  # while decoding in double precision
 
 
@@ -34,8 +35,8 @@ def read_planes(
 
     **Returns:** the channels, the attributes of the file, and whether its values are floats.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read, is truncated or
-    does not fit into memory.
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read, is truncated, does
+    not store exactly the whole picture, or does not fit into memory.
     """
     import OpenImageIO as oiio  # 17 MB, so imported only here
 
@@ -46,6 +47,13 @@ def read_planes(
     if file is not None:
         spec = file.spec()
         values = float(spec.width) * spec.height * spec.nchannels
+        expect(
+            spec.roi == spec.roi_full,
+            path,
+            f"stores {spec.width} x {spec.height} pixels at ({spec.x}, {spec.y}) of a picture of "
+            f"{spec.full_width} x {spec.full_height} at ({spec.full_x}, {spec.full_y}); save all "
+            "of it, and no more",
+        )
         size = f"{path}: a picture of {spec.width} x {spec.height} x {spec.nchannels} numbers"
         check_memory(size, _BYTES_PER_VALUE * values, "give a smaller one")
         pixels = file.read_image("float")
@@ -70,7 +78,8 @@ def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
     **Returns:** R, G and B, or Y alone, as in the file.
 
     **Raises:** `FileNotFoundError`, or `ValueError` if the file cannot be read, has neither R, G
-    and B nor Y, or contains integers, which are encoded for a display.
+    and B nor Y, has other primaries than Rec. 709 and D65, or contains integers, which are encoded
+    for a display.
     """
     values, is_linear = _colors(path)
     expect(is_linear, path, "is encoded for a display; give linear light, such as OpenEXR")
@@ -98,9 +107,16 @@ def read_color(path: StrPath) -> Float[np.ndarray, "height width 3"]:
 
 
 def _colors(path: StrPath) -> tuple[Float[np.ndarray, "height width _"], bool]:
-    planes, _, is_linear = read_planes(path)
+    planes, attributes, is_linear = read_planes(path)
     names = "RGB" if "R" in planes else "Y"
     expect(planes.keys() >= {*names}, path, f"has neither R, G and B nor Y: {', '.join(planes)}")
+    primaries = np.asarray(attributes.get("chromaticities", _REC709_D65))
+    expect(
+        names == "Y" or np.allclose(primaries, _REC709_D65, atol=_CHROMATICITY),
+        path,
+        f"has other primaries than Rec. 709 and D65: {np.round(primaries, 4).tolist()}; convert "
+        "it, or remove `chromaticities` from data",
+    )
     with np.errstate(invalid="ignore"):  # from signaling NaN
         return np.stack([planes[name] for name in names], axis=-1).astype(np.float64), is_linear
 
@@ -117,15 +133,16 @@ def write_png(
 
     **Arguments:**
 
-    - `picture`: a frame, whose beauty is written over black, or linear values of 1 (gray), 3 (RGB)
-      or 4 channels (premultiplied RGB and alpha, written unpremultiplied as PNG requires).
+    - `picture`: a frame, whose beauty is written over black, or linear floating-point values of 1
+      (gray), 3 (RGB) or 4 channels (premultiplied RGB and alpha, written unpremultiplied as PNG
+      requires).
     - `exposure`: exposure in stops: values are multiplied by `2^exposure`, clipped at 1 and
       encoded.
     - `wavelengths`: wavelengths of the channels, nm, such as `material.wavelengths`; the spectra
       are converted to color under an `illuminant`, as `picture_to_rgb` does.
 
-    **Raises:** `ValueError` for another suffix or number of channels, and for an exposure that is
-    not finite; `FileNotFoundError` if the folder does not exist.
+    **Raises:** `ValueError` for another suffix, number of axes or channels, for integers, and for
+    an exposure that is not finite; `FileNotFoundError` if the folder does not exist.
     """
     check_suffix(path, ".png")
     values = picture.beauty if isinstance(picture, Frame) else picture
@@ -138,52 +155,6 @@ def write_png(
         temporary.write_bytes(content)
 
 
-def write_animation(
-    path: StrPath, frames: Sequence[StrPath], *, frames_per_second: float = 24.0
-) -> None:
-    r"""Write pictures as a lossless, endlessly repeating WebP animation, atomically.
-
-    **Arguments:**
-
-    - `frames`: PNG files in order, at least one, all of equal size.
-    - `frames_per_second`: from 0.1 to 60; browsers slow down faster animations.
-
-    **Raises:** `ValueError` without frames, for unequal sizes, and for a speed out of range;
-    `OSError` if a frame cannot be read or the folder does not exist.
-    """
-    expect(
-        frames and 0.1 <= frames_per_second <= 60,
-        path,
-        f"{len(frames)} frames at {frames_per_second:g} per second; give at least one frame, and "
-        "0.1 to 60 per second",
-    )
-    # Round the start times of frames to milliseconds, so that rounding errors do not add up.
-    begins = [round(1000 * i / frames_per_second) for i in range(len(frames) + 1)]
-    options = {"save_all": True, "duration": np.diff(begins).tolist(), "loop": 0, "lossless": True}
-    with atomic_path(path) as temporary:
-        _Film(frames).save(temporary, format="WEBP", **options)
-
-
-class _Film(Image.Image):
-    """A picture of many frames that are files, with only one frame in memory at a time."""
-
-    def __init__(self, frames: Sequence[StrPath]):
-        super().__init__()
-        self._frames, self.n_frames = frames, len(frames)
-        self.seek(0)
-
-    def seek(self, frame: int) -> None:
-        with Image.open(self._frames[frame]) as image:
-            image.load()
-            expect(
-                self.size in ((0, 0), image.size),
-                self._frames[frame],
-                f"is {image.size} pixels, and the first is {self.size}; give all the same size",
-            )
-            self.im, self._mode, self._size = image.im, image.mode, image.size
-
-
-_REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _WEIGHTS, _VARIANCES = "splatjax.weights.", "splatjax.variances"
 _SINGLE = "single_scattering"
 _LARGEST_HALF = 65504.0

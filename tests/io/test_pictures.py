@@ -56,6 +56,8 @@ def test_other_readers_rebuild_diffuse_from_layers_and_header_alone(tmp_path):
     np.testing.assert_allclose(np.ravel(header["chromaticities"])[:2], [0.64, 0.33], rtol=1e-6)
     assert all(plane.dtype == np.float32 for plane in planes.values())
     assert read_manifest(path) == manifest
+    (tmp_path / "bad.exr").write_bytes(path.read_bytes().replace(b'"--width"', b'"--width '))
+    assert_refused(lambda: read_manifest(tmp_path / "bad.exr"), r"bad\.exr: Expecting")
     names = oiio.ImageInput.open(str(path)).spec().channelnames
     assert {"R", "A", "Z", "position.X", "albedo.R", "shadow2.Y", "diffusion4.G"} <= {*names}
     # Nuke and Blender read `layer.channel`, and Blender only the channels R, G, B, A, X, Y, Z.
@@ -98,6 +100,24 @@ def test_the_header_has_the_camera_as_renderman_defines_it(tmp_path):
     x, y, z, w = np.append(point, 1) @ to_picture
     np.testing.assert_allclose([50 * x / w, 60 * y / w], [column, row], atol=1e-3)
     assert 0 < z / w < 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "fault"),
+    [
+        ("x", 2, r"4 x 3 pixels at \(2, 0\)"),
+        ("full_width", 9, "picture of 9 x 3"),
+        ("chromaticities", [0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767], "0.713"),
+    ],
+)
+def test_cropped_pictures_and_other_primaries(tmp_path, name, value, fault):
+    image = oiio.ImageBuf(oiio.ImageSpec(4, 3, 3, "float"))
+    if name == "chromaticities":
+        image.specmod().attribute(name, "float[8]", value)
+    else:
+        setattr(image.specmod(), name, value)
+    image.write(str(tmp_path / "a.exr"))
+    assert_refused(lambda: read_picture(tmp_path / "a.exr"), rf"a\.exr: .*{fault}")
 
 
 ENCODED = {

@@ -233,6 +233,7 @@ CALLS = [
     ("a.png", read_picture, "encoded for a display"),
     ("new.png", lambda path: write_png(path, np.zeros((2, 2, 7))), "7 channels"),
     ("new.png", lambda path: write_png(path, POINTS[None], exposure=np.nan), "exposure is nan"),
+    ("new.gif", film(["a.png"]), "must end in .webp"),
     ("new.exr", lambda path: write_png(path, POINTS[None]), "must end in .png"),
     ("new.png", lambda path: sj.write_exr(path, some_frame()), "must end in .exr"),
     ("new.webp", film([]), "0 frames"),
