@@ -204,6 +204,11 @@ def check_values(
         )
 
 
+def check_ascending(name: str, values: Any) -> None:
+    steps, requirement = np.diff(values), f"positive: {name} ascend; sort them"
+    check_values(f"the steps of {name}", steps, requirement, lambda x: x > 0)
+
+
 _RECORDS = (eqx.Module, NoneType)
 
 

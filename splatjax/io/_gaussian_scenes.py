@@ -52,7 +52,12 @@ def surface_columns(
             for names in (_PLACES, _COLORS, _SCALES, _TURNS)
         )
         scales = np.exp(scales)
-    expect(is_kept.any(), path, f"no Gaussian has an opacity of {opacity:g}; give a lower opacity")
+    expect(
+        is_kept.sum() >= 4,
+        path,
+        f"{is_kept.sum()} Gaussians have an opacity of {opacity:g}, and normals need at least 4; "
+        "give a lower opacity",
+    )
     axes = Rotation.from_quat(turns).as_matrix()
     normals = axes[np.arange(len(axes)), :, scales.argmin(axis=1)]
     is_inward = np.sum(normals * estimate_normals(centers), axis=1) < 0

@@ -46,8 +46,8 @@ def save_gltf(
       hexagon for each splat.
     - `lux`: irradiance of 1 lux in the unit of the lights, as for `load_lights`.
 
-    A warning reports contents that glTF cannot store: lights of other kinds, and a principal point
-    away from the middle of the picture.
+    A warning reports contents that glTF cannot store: lights of other kinds, spot lights wider than
+    a half-space, and a principal point away from the middle of the picture.
 
     **Raises:** `ValueError` for a suffix other than .glb, for a `lux` that is not positive, and for
     a material of neither one nor three channels; `OSError` if the file cannot be written.
@@ -74,16 +74,16 @@ def save_gltf(
             "picture; write USD, or leave out principal_point",
             stacklevel=2,
         )
-    named = [light for light in scene.lights if type(light) in _KINDS]
+    named = [light for light in scene.lights if _is_punctual(light)]
     if len(named) < len(scene.lights):
         lost = ", ".join(
             f"light {number} ({type(light).__name__})"
             for number, light in enumerate(scene.lights, 1)
-            if type(light) not in _KINDS
+            if not _is_punctual(light)
         )
         warnings.warn(
             f"{path}: glTF cannot store {lost}, so the file lacks them; write USD, or give "
-            "directional, point and spot lights",
+            "directional and point lights, and spot lights with angles up to 90 degrees",
             stacklevel=2,
         )
 
@@ -151,6 +151,10 @@ def _material(path: StrPath, material: Material, has_albedo: bool, thickness: fl
             for name, entries in extensions.items()
         },
     }
+
+
+def _is_punctual(light: AbstractLight) -> bool:
+    return type(light) in _KINDS and float(getattr(light, "outer_angle", 0)) <= 90
 
 
 def _light(light: AbstractLight, lux: float) -> dict[str, Any]:

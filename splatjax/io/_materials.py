@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from splatjax._library import profiles_folder as profiles_folder
-from splatjax._records import check_values
+from splatjax._records import check_ascending, check_values
 from splatjax.exports import plain_numbers
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
@@ -110,13 +111,7 @@ def load_material(name_or_path: StrPath | Table) -> Material:
             stacklevel=1,  # so that a command that loads a file several times warns once
         )
     gaussians = fit.record(SumOfGaussians)
-    fit.make(
-        check_values,
-        "the steps of variances",
-        np.diff(gaussians.variances),
-        "positive: variances ascend",
-        lambda x: x > 0,
-    )
+    fit.make(check_ascending, "variances", gaussians.variances)
     terms: dict[str, Any] = dict(surface)
     if isinstance(profile, Dipole):
         terms["medium"] = profile.medium
@@ -206,7 +201,8 @@ def save_material(
 
     **Arguments:**
 
-    - `material`: one material (no batch), written with enough digits to be restored exactly.
+    - `material`: one material (no batch), written with enough digits to be restored exactly; its
+      roughness is clamped to [0.05, 1], as in rendering.
     - `path`: path of the file; its folder must exist.
     - `profile`: the profile to which the Gaussians were fitted. Its coefficients are written
       instead of the material's `medium`, and its kind is written to [fit].
@@ -214,7 +210,8 @@ def save_material(
     - `fit`: further entries of [fit]: `error`, `energy_error`, ...
     - `g`: mean cosine of the phase function, written to [medium].
 
-    **Raises:** `OSError` if the file cannot be written; `ValueError` for another kind of profile.
+    **Raises:** `OSError` if the file cannot be written; `ValueError` for another kind of profile,
+    and for variances that do not ascend.
     """
     write_toml(path, plain_material(material, profile, source, fit, g))
 
@@ -232,6 +229,9 @@ def plain_material(
             "profile must be a Dipole, BetterDipole, PhotonBeam, LayeredMultipole, Skin or Burley, "
             f"which a file can store; got {type(profile).__name__}"
         )
+    check_ascending("variances", material.gaussians.variances)
+    surface = {name: getattr(material, name) for name in _SURFACE}
+    surface["roughness"] = jnp.clip(material.roughness, 0.05, 1.0)  # as rendered
     tables: dict[str, Any] = {}
     if isinstance(profile, Skin):
         tables["skin"] = plain_record(profile)
@@ -249,7 +249,7 @@ def plain_material(
     if material.wavelengths is not None:
         tables["wavelengths"] = plain_numbers(material.wavelengths)
     return tables | {
-        "surface": {name: plain_numbers(getattr(material, name)) for name in _SURFACE},
+        "surface": {name: plain_numbers(value) for name, value in surface.items()},
         "source": dict(source or {}),
         "fit": {
             "unit": VARIANCE_UNIT,

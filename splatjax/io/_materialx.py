@@ -9,7 +9,7 @@ import numpy as np
 from splatjax.exports import openpbr_subsurface, plain_numbers
 from splatjax.scene import Material
 
-from ._files import StrPath, atomic_path, check_units, expect
+from ._files import StrPath, atomic_path, check_suffix, check_units, expect
 
 _DOCUMENT = Template("""<?xml version='1.0' encoding='utf-8'?>
 <materialx version="1.39" colorspace="lin_rec709">
@@ -39,9 +39,10 @@ def save_materialx(
     - `mm_per_unit`: length of the unit of the other renderer's scene, mm.
     - `g`: mean cosine of the material's phase function (`load_mean_cosine`).
 
-    **Raises:** `ValueError` for another number of channels; `OSError` if the file cannot be
-    written.
+    **Raises:** `ValueError` for another suffix than `.mtlx` or number of channels; `OSError` if the
+    file cannot be written.
     """
+    check_suffix(path, ".mtlx")
     check_units(path, mm_per_unit)
     inputs = openpbr_inputs(path, material, mm_per_unit, g)
     lines = []

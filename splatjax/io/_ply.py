@@ -14,7 +14,16 @@ from splatjax._display import srgb_to_linear
 from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
-from ._files import StrPath, atomic_path, check_units, existing_file, expect, naming, with_y_up
+from ._files import (
+    StrPath,
+    atomic_path,
+    check_suffix,
+    check_units,
+    existing_file,
+    expect,
+    naming,
+    with_y_up,
+)
 from ._gaussian_scenes import GAUSSIAN_COLUMNS, spz_columns, surface_columns
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
@@ -118,11 +127,13 @@ def read_splats(
 def write_splats(path: StrPath, splats: Splats) -> None:
     r"""Write splats to a binary PLY file in mm, as float32, atomically.
 
-    An albedo of three channels is written as linear `red green blue` floats.
+    An albedo of three channels is written as linear `red green blue` floats, clipped to [0, 1].
 
-    **Raises:** `FileNotFoundError` if the folder does not exist; `ValueError` for an albedo that
-    does not have three channels.
+    **Raises:** `FileNotFoundError` if the folder does not exist; `ValueError` for another suffix
+    than `.ply`, for an albedo that does not have three channels, and for values that `read_splats`
+    refuses.
     """
+    check_suffix(path, ".ply")
     path, names, columns = Path(path), [], []
     for field, aliases in _COLUMNS.items():
         values = getattr(splats, field)
@@ -133,6 +144,8 @@ def write_splats(path: StrPath, splats: Splats) -> None:
                 path,
                 f"{field} has {table.shape[1]} channels; a PLY file stores {', '.join(aliases[0])}",
             )
+            table = np.clip(table, 0, 1) if field == "albedo" else table
+            _values(path, field, dict(zip(aliases[0], table.T, strict=True)), 1.0)
             names += aliases[0]
             columns.append(table)
     if splats.weights is not None:
@@ -172,12 +185,7 @@ class SplatFile:
     """
 
     def __init__(
-        self,
-        path: StrPath,
-        part: int = 1_000_000,
-        *,
-        mm_per_unit: float = 1.0,
-        up: str = "y",
+        self, path: StrPath, part: int = 1_000_000, *, mm_per_unit: float = 1.0, up: str = "y"
     ):
         self.path, self.part, self.mm_per_unit, self.up = existing_file(path), part, mm_per_unit, up
         check_units(self.path, mm_per_unit, up)
@@ -194,6 +202,7 @@ class SplatFile:
                 f"its vertices are not the first element, in binary without lists; {_COMPLETE}",
             )
             self.count, self._offset = vertices["length"], file.tell()
+            expect(self.count, path, "has no vertices; give at least one")
             self._names, self._columns = tuple(kinds), np.dtype(list(kinds.items()))
             self._rows(0, self.count)  # raises if the file is truncated
         for field in ("normals", "radii", "areas"):

@@ -147,4 +147,5 @@ def test_normalized_diffusion_stands_for_gaussians_alone(tmp_path, float64):
 def test_two_channels_are_refused(tmp_path):
     two = sj.Material(sj.SumOfGaussians([1.0], [[0.5] * 2]))
     assert_refused(lambda: save_materialx(tmp_path / "it.mtlx", two), r"it.mtlx: .* 2 channels")
+    assert_refused(lambda: save_materialx(tmp_path / "it.toml", two), r"it.toml: .*\.mtlx")
     assert not list(tmp_path.iterdir())

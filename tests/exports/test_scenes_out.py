@@ -188,8 +188,9 @@ def test_what_cannot_be_written_is_named(tmp_path, monkeypatch):
     glb, usda = tmp_path / "it.glb", tmp_path / "it.usda"
     beam = sj.GaussianBeam([0, 0, 9], [0, 0, -1], 5.0, 4.0)
     two = sj.SumOfGaussians([1.0], [[0.5] * 2])
-    with pytest.warns(UserWarning, match=r"it\.glb: .*4 \(GaussianBeam\), .* 5 \(SphereLight"):
-        save_gltf(glb, a_scene(*PUNCTUAL, beam, SphereLight([9, 9, 9], 1.0, 2.0)), CAMERA)
+    others = beam, SphereLight([9, 9, 9], 1.0, 2.0), replace(PUNCTUAL[2], outer_angle=120)
+    with pytest.warns(UserWarning, match=r"it\.glb: .*4 \(Gauss.* 5 \(Sphere.* 6 \(Spot.*USD"):
+        save_gltf(glb, a_scene(*PUNCTUAL, *others), CAMERA)
     assert len(load_lights(glb, mm_per_unit=1.0)) == 3
     with pytest.warns(UserWarning, match=r"it\.glb: .*principal"):
         save_gltf(glb, a_scene(), replace(CAMERA, principal_point=[0.4, 0.7]))

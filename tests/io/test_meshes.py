@@ -261,6 +261,18 @@ def test_splats_come_back_at_once_and_in_parts(tmp_path):
     assert_same(sj.read_splats(path, mm_per_unit=2.0, up="z"), together)
 
 
+def test_splats_that_cannot_be_written_or_read(tmp_path):
+    """Rounding of an albedo can."""
+    splats, path = some_splats(), tmp_path / "a.ply"
+    sj.write_splats(path, dataclasses.replace(splats, albedo=splats.albedo * 0 + 1 + 5e-6))
+    np.testing.assert_array_equal(sj.read_splats(path).albedo, 1)
+    dots = dataclasses.replace(splats, radii=0 * splats.radii)
+    assert_refused(lambda: sj.write_splats(path, dots), r"a\.ply: radius of vertex 0")
+    assert_refused(lambda: sj.write_splats(tmp_path / "a.obj", splats), r"a\.obj: .*\.ply")
+    write_ply(path, {name: column[:0] for name, column in columns_of(splats).items()})
+    assert_refused(lambda: sj.SplatFile(path), r"a\.ply: has no vertices")
+
+
 @pytest.mark.parametrize(
     ("color", "scale", "green"),
     [("u1", 1, 0.2158605), ("u2", 257, 0.2158605), ("f4", 1 / 255, 128 / 255)],
@@ -307,7 +319,9 @@ def test_ellipsoids_of_a_gaussian_splatting_scene_become_discs(tmp_path):
     np.testing.assert_allclose(ball.areas.sum(), 4 * np.pi * 20**2, rtol=0.1)
     with pytest.warns(UserWarning, match="0 of 120"):
         assert sj.read_splats(path, opacity=0.1).count == 120
-    assert_refused(lambda: sj.read_splats(path, opacity=0.9), r"no Gaussian has an opacity of 0\.9")
+    assert_refused(lambda: sj.read_splats(path, opacity=0.9), r": 0 Gaussians .* 0\.9")
+    gsply.plywrite(path, gsply.plyread(path)[:1])
+    assert_refused(lambda: sj.read_splats(path, opacity=0.0), r"gaussians\.ply: 1 Gaussians")
 
 
 def test_a_compressed_gaussian_splatting_scene_is_that_of_its_ply_file(tmp_path, monkeypatch):
