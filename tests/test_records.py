@@ -168,6 +168,16 @@ def test_traced_values_and_placeholders_pass_through_transformations():
         (lambda: camera(fov=180.0), "fov"),
         (lambda: camera(width=0), "Camera.width must be at least 1 .* got 0"),
         (lambda: camera(height=-1), "Camera.height must be at least 1 .* got -1"),
+        (lambda: sj.Camera([0, 0, 9], np.eye(3), 1, 24.5, 2), "Camera.width must .* got 24.5"),
+        (
+            lambda: sj.Camera([0, 0, 9], [[2, 0, 0], [0, 5, 0], [0, 0, 1]], 1, 2, 2),
+            "Camera.rotation.* 3 at",
+        ),
+        (
+            lambda: sj.scene.RectangleLight([9, 0, 0], 1, [[0, 1, 0], [0, 1, 1]]),
+            r"RectangleLight\.edges .* 0\.7",
+        ),
+        (lambda: splats().scaled(np.nan), "scale must be positive; got nan"),
         (lambda: camera([0, 0, 1e25]), r"e\+2[45]"),
         (lambda: camera([0, 0, np.nan]), "nan"),
         (lambda: camera([1, 2, 3], [1, 2, 3]), "eye and target"),
@@ -305,6 +315,8 @@ EYE, TARGET = np.asarray([30.0, 20.0, 50.0]), np.asarray([1.0, -2.0, 3.0])
         (lambda: sj.make_plan(sj.Scene(splats(), light(), material()), splats()), "cameras"),
         (lambda: sj.fit_gaussians(medium()), "profile"),
         (lambda: sj.bust("large"), "count"),
+        (lambda: sj.write_png("none/a.png", np.ones((4, 4, 3), np.uint8)), "picture"),
+        (lambda: sj.write_png("none/a.png", np.ones((4, 4))), "picture"),
     ],
 )
 def test_an_object_of_another_kind_is_refused_by_name(make, name):

@@ -120,6 +120,7 @@ def _camera(where: str, lens: _Lens, pose: _Pose, mm_per_unit: float, up: str) -
         f"fl_x is {focal_x:g} and fl_y is {focal_y:g}, so pixels are not square; "
         "reconstruct with one focal length, such as SIMPLE_PINHOLE",
     )
+    expect(np.isfinite(pose).all(), where, f"its pose {pose.tolist()} must be finite; correct it")
     left, scales, right = np.linalg.svd(pose[:3, :3])
     expect(
         scales[0] < (1 + _SHEAR) * scales[2] and np.linalg.det(left @ right) > 0,

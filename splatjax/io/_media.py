@@ -95,6 +95,7 @@ def plain_openpbr(table: Table) -> tuple[dict[str, Any], dict[str, float]]:
         "subsurface_weight must be 1; mixtures with an opaque surface are not supported",
     )
     per_unit = _MM[table.one_of("unit", _MM)]
+    table.number("subsurface_radius", 1.0)  # raises if it is not one number
     color, radius, scale, eta, g = (table.numbers(*entry) for entry in _OPENPBR.items())
     medium = {"color": color, "mean_free_path": per_unit * radius * scale, "eta": eta, "g": g}
     plain = {name: values.tolist() for name, values in medium.items()}

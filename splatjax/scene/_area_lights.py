@@ -17,6 +17,7 @@ from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSamp
 from ._scene import rotation_towards
 
 _GRAZING = 1e-3  # least cosine between a mirrored ray and the normal of an emitter
+_PERPENDICULAR = 1e-3  # greatest cosine between the edges of a rectangle
 _RIM = 16  # number of points on the rim of a disk
 _GOLDEN = (5**0.5 - 1) / 2
 
@@ -127,6 +128,12 @@ class RectangleLight(AbstractAreaLight):
                 self.normal_and_area()[1],
                 "two vectors that span an area; the area is 0",
                 lambda area: area > 0,
+            )
+            check_values(
+                "the cosine between RectangleLight.edges",
+                jnp.vdot(*self.edges) / jnp.prod(jnp.linalg.norm(self.edges, axis=1)),
+                "0: edges are perpendicular",
+                lambda cosine: np.abs(cosine) < _PERPENDICULAR,
             )
 
     @classmethod

@@ -30,6 +30,8 @@ from ._material import Material
 
 _PARALLEL = 1e-6  # sine of an angle below the resolution of float32
 _FARTHEST = 1e15  # float32 can represent the square, and larger products with it
+_ORTHONORMAL = 1e-2  # tolerance of products of the axes of a camera
+_PIXELS = valid("at least 1 (pixels), an int", lambda x: (x >= 1) & (x.dtype.kind in "iu"))
 
 
 @record
@@ -52,7 +54,7 @@ class Camera(eqx.Module):
     - `principal_point`: where the forward axis meets the picture: column divided by `width` and row
       divided by `height`. `None` is the middle, `[0.5, 0.5]`. Differentiable.
 
-    **Raises:** `ValueError` for a picture without pixels, and for numbers that are not finite.
+    **Raises:** `ValueError` for a size or a number out of range, and for axes not orthonormal.
     """
 
     position: Float[Array, "3"] = eqx.field(converter=numbers, metadata=valid("finite (mm)"))
@@ -60,12 +62,22 @@ class Camera(eqx.Module):
     focal_length: Float[Array, ""] = eqx.field(
         converter=numbers, metadata=valid("positive", lambda x: x > 0)
     )
-    width: int = eqx.field(static=True, metadata=valid("at least 1 (pixels)", lambda x: x >= 1))
-    height: int = eqx.field(static=True, metadata=valid("at least 1 (pixels)", lambda x: x >= 1))
+    width: int = eqx.field(static=True, metadata=_PIXELS)
+    height: int = eqx.field(static=True, metadata=_PIXELS)
     near: float = eqx.field(static=True, default=1e-2)
     principal_point: Float[Array, "2"] | None = eqx.field(
         converter=numbers, default=None, metadata=valid("finite (over width and height)")
     )
+
+    def __check_init__(self):
+        if isinstance(self.rotation, jax.Array) and not is_traced(self.rotation):
+            rotation = np.asarray(self.rotation, float)
+            check_values(
+                "products of the rows of Camera.rotation, minus the identity,",
+                rotation @ rotation.T - np.eye(3),
+                "0: rows are orthonormal",
+                lambda x: np.abs(x) < _ORTHONORMAL,
+            )
 
     @property
     def principal_pixel(self) -> tuple[Any, Any]:
@@ -103,8 +115,7 @@ class Camera(eqx.Module):
         for traced arrays.
         """
         check_values("fov", fov, "between 0 and 180 degrees", lambda x: (x > 0) & (x < 180))
-        points = as_floats([eye, target, up], name="eye, target and up")
-        eye, target, up = points
+        eye, target, up = points = as_floats([eye, target, up], name="eye, target and up")
         forward = target - eye
         if not is_traced(points):
             checked, direction = np.asarray(points, np.float64), np.asarray(forward, np.float64)
@@ -214,10 +225,8 @@ class Splats(eqx.Module):
         return self.centers.shape[0]
 
     def scaled(self, factor: Float[Array, ""] | float) -> "Splats":
-        """Scale the body about the origin. The distance that light travels in the material is
-        unchanged, so a smaller body is more translucent.
-
-        **Raises:** `ValueError` for a factor that is not positive.
+        """Scale the body about the origin by a positive factor. The distance that light travels in
+        the material is unchanged, so a smaller body is more translucent.
         """
         check_values("the scale", factor, "positive", lambda x: x > 0)
         return eqx.tree_at(

@@ -159,6 +159,7 @@ STRETCHED, MIRRORED = ([{"transform_matrix": np.diag([1.0, n, 1, 1]).tolist()}] 
         ({"frames": STRETCHED}, "sheared"),
         ({"frames": MIRRORED}, "mirrored"),
         ({"frames": [{"transform_matrix": [[1, 2]]}]}, "transforms.json"),
+        ({"frames": [{"transform_matrix": (np.inf * np.ones((4, 4))).tolist()}]}, "finite"),
     ],
 )
 def test_cameras_that_cannot_be_ours(transforms, changes, value):

@@ -159,6 +159,16 @@ def test_a_saved_material_comes_back_bit_for_bit(tmp_path, model):
     assert "\neta = 1.37\n" in path.read_text()  # the shortest number that is read back exactly
 
 
+def test_what_is_saved_can_be_loaded(tmp_path):
+    """Roughness as it is rendered."""
+    for roughness, expected in ((0.0, 0.05), (1.5, 1.0)):
+        material = sj.Material(sj.SumOfGaussians([1.0, 2.0], [0.1, 0.2]), roughness=roughness)
+        save_material(material, tmp_path / "a.toml")
+        np.testing.assert_allclose(load_material(tmp_path / "a.toml").roughness, expected)
+    descending = sj.Material(sj.SumOfGaussians([2.0, 1.0], [0.1, 0.2]))
+    assert_refused(lambda: save_material(descending, tmp_path / "a.toml"), "variances .* -1 ")
+
+
 @pytest.mark.parametrize(
     ("name", "before", "after"),
     [
@@ -279,6 +289,10 @@ BAD = [
     (
         '[openpbr]\nunit = "mm"\nsubsurface_weight = 0.5\n',
         r"\[openpbr\] subsurface_weight must be 1",
+    ),
+    (
+        '[openpbr]\nunit = "mm"\nsubsurface_radius = [1, 2]\n',
+        r"\[openpbr\] subsurface_radius must be one number",
     ),
     ("[skin]\nmelanin = 2.0\n", r"\[skin\]: Skin.melanin must be between 0 and 1; got 2"),
     ("[skin]\nmelanine = 0.1\n", r"\[skin\] has an unknown entry 'melanine'; did you mean"),
