@@ -117,7 +117,7 @@ class Table:
 
     def whole(self, name: str, default: float | None = None) -> int:
         value = self.number(name, default)
-        self.expect(value.is_integer(), f"{name} must be a whole number; it is {value:g}")
+        self.expect(value % 1 == 0, f"{name} must be a whole number; it is {value:g}")
         return int(value)
 
     def vector(self, name: str, default: list[float] | None = None) -> Array:
