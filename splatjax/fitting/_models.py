@@ -83,6 +83,8 @@ class TransportModel(AbstractModel):
         fitted = fit_gaussians(model.profile(medium), weights=weights, rule=model.rule)
         material = Material(fitted.gaussians, eta=1.3, angles=model.angles(medium))
 
+    Single scattering is that of the phase function.
+
     `rule` starts at half a mean free path, because splats hardly resolve smaller radii. It weights
     radii by their fifth power, so that the fit is accurate deep inside a shadow.
 
@@ -101,7 +103,11 @@ class TransportModel(AbstractModel):
         return HalfSpace(medium, self.g)
 
     def profile(self, medium: Medium) -> PhotonBeam:
-        return PhotonBeam(medium).with_total(self.half_space(medium).total_reflectance())
+        space = self.half_space(medium)
+        # Henyey and Greenstein's phase function backwards, over isotropic scattering with the
+        # reduced coefficient; for negative g, a fit to light transport.
+        single = jnp.where(space.g > 0, 1 / (1 + space.g), 1 - space.g) ** 2
+        return PhotonBeam(medium, single=single).with_total(space.total_reflectance())
 
     def angles(self, medium: Medium) -> AngularLaw:
         return self.half_space(medium).angular_law()

@@ -10,7 +10,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import numbers, record
+from splatjax._records import check_values, numbers, record
 from splatjax.gaussians import AbstractProfile
 
 from ._dipole import AbstractHalfSpace, BetterDipole
@@ -20,6 +20,7 @@ from ._quadrature import along_first_axis, integrated_reflectance, unit_interval
 _NODES = 128
 _LEAST_COSINE = 1e-4
 _COSINES = 10
+_LEAST_PART = 0.5
 
 
 @record
@@ -167,42 +168,60 @@ class PhotonBeam(AbstractHalfSpace):
     - `medium`: its coefficients, [channels]; scattering is isotropic with the reduced coefficient.
     - `fresnel`: the diffuse Fresnel moments of the surface that diffuse light meets.
     - `strength`: factor of multiple scattering, [channels]; 1 as published. `with_total` sets it.
+    - `single`: factor of single scattering, [channels]; 1 for isotropic scattering.
 
     **Source:** Habel, Christensen and Jarosz 2013, "Photon beam diffusion".
     """
 
     strength: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0)
+    single: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0)
 
     singular: ClassVar[bool] = True
 
     @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        return self.multiply_scattered()(r) + SingleScattering(self.medium)(r)
+        multiple = _MultipleScattering(self.medium, self.fresnel, self.strength)
+        return multiple(r) + SingleScattering(self.medium, self.single)(r)
 
     @jit_unless_traced
     def with_total(self, total: Float[Array, " channels"]) -> "PhotonBeam":
         """Scale multiple scattering so that the total reflectance is `total`, for example that of
-        light transport (`HalfSpace`). The unscaled total differs from it by 1 to 6%.
+        light transport (`HalfSpace`). The unscaled total of isotropic scattering differs from it by
+        1 to 9%. Where less than half of multiple scattering's part of `total` would be left to it,
+        it keeps this half, and single scattering is scaled, too.
         """
-        single = SingleScattering(self.medium).total_reflectance()
-        multiple = self.multiply_scattered().total_reflectance() / self.strength
-        return PhotonBeam(self.medium, self.fresnel, (jnp.asarray(total) - single) / multiple)
+        single = SingleScattering(self.medium, self.single).total_reflectance()
+        multiple = _MultipleScattering(self.medium, self.fresnel).total_reflectance()
+        strength = (jnp.asarray(total) - single) / multiple
+        added = jnp.maximum(_LEAST_PART * total / (single + multiple) - strength, 0)
+        factor = self.single * (1 - added * multiple / single)
+        return PhotonBeam(self.medium, self.fresnel, strength + added, factor)
 
     @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Compute `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple
         scattering by quadrature.
         """
-        return (
-            self.multiply_scattered().total_reflectance()
-            + SingleScattering(self.medium).total_reflectance()
-        )
+        multiple = _MultipleScattering(self.medium, self.fresnel, self.strength)
+        single = SingleScattering(self.medium, self.single)
+        return multiple.total_reflectance() + single.total_reflectance()
 
     def multiply_scattered(self) -> AbstractProfile:
-        """Return the profile of light scattered more than once, which is finite at `r = 0`. Use it
-        for a material with a separate `SingleScattering`.
+        """Return multiple scattering, which is finite at `r = 0`, for a material with a separate
+        `SingleScattering(medium)`. Together they have the total of this profile.
+
+        **Raises:** `ValueError` where single scattering exceeds the total.
         """
-        return _MultipleScattering(self.medium, self.fresnel, self.strength)
+        multiple = _MultipleScattering(self.medium, self.fresnel).total_reflectance()
+        single = SingleScattering(self.medium).total_reflectance()
+        strength = self.strength - (1 - self.single) * single / multiple
+        check_values(
+            "the strength of multiple scattering",
+            strength,
+            "positive: single scattering exceeds the total; do not separate it, or lower g",
+            lambda x: x > 0,
+        )
+        return _MultipleScattering(self.medium, self.fresnel, strength)
 
 
 @record
@@ -212,7 +231,7 @@ class _MultipleScattering(AbstractHalfSpace):
     @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         shape = (_NODES, *r.shape, self.medium.channels)
-        depth, weight = (along_first_axis(nodes, shape, r.dtype) for nodes in _beam())
+        depth, weight = (along_first_axis(nodes, shape, self.medium.eta.dtype) for nodes in _beam())
         sigma_t_prime = jnp.broadcast_to(self.medium.sigma_t_prime, shape)
         depth = depth / sigma_t_prime
         squared_radius = jnp.broadcast_to((r * r)[None, ..., None], shape)

@@ -76,6 +76,14 @@ def test_channels_at_their_own_radii_are_those_at_all_radii(float64, name):
 
 
 @models
+def test_radii_may_be_integers(float64, name):
+    profile = MODELS[name](medium(), 1.0)
+    with jax.numpy_dtype_promotion("standard"):
+        found = profile(jnp.arange(1, 4))
+    np.testing.assert_allclose(found, profile(jnp.arange(1.0, 4.0)), rtol=1e-13)
+
+
+@models
 def test_total_is_the_integral(float64, name):
     profile = MODELS[name](medium(), 1.0)
     # Hankel transforms leave 1e-16 / r: an end at 3000 free paths keeps that out, and what

@@ -310,6 +310,27 @@ def test_gradients_at_matched_indices_are_the_limits_and_finite_at_grazing_angle
         assert np.isfinite(slope(1.0, *mu))
 
 
+@pytest.mark.long
+@pytest.mark.once
+@pytest.mark.parametrize("sigma_a", [1.0, 2.0, 5.0])
+def test_the_profile_of_absorbing_media_that_scatter_forward(float32, sigma_a):
+    """In rings around the point of entry, in mean free paths; the shape of multiple scattering is
+    that of isotropic scattering.
+    """
+    medium, edges = sj.Medium([sigma_a], [1.0], 1.4), np.asarray([0, 0.2, 0.5, 1, 2, 4])
+    edges = edges / float(medium.sigma_t_prime[0])
+    walk = sj.transport.monte_carlo(
+        [sj.Layer(medium, jnp.inf)], 400_000, jax.random.key(3), edges=edges, g=0.8
+    )
+    profile = sj.fitting.TransportModel(0.8).profile(medium)
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
+    r = jnp.asarray(middle[:, None] + half[:, None] * nodes[None])
+    means = np.sum(weights[None] * r * profile(r)[..., 0], axis=1) / (2 * middle)
+    ratio = means / np.asarray(walk.reflected.value)[:, 0]
+    np.testing.assert_allclose(ratio, 1, atol=0.25)
+
+
 def test_a_table_and_a_photon_beam_are_it_and_the_rest():
     r, ours = jnp.asarray([0.1, 0.5, 2.0]), single(0.97, 1.3, channels=2)
     table = sj.scattering.Tabulated(r, 2 * ours(r), total=2 * ours.total_reflectance())
