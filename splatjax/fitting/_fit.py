@@ -13,7 +13,7 @@ from splatjax._records import Numbers, as_floats, is_traced, require
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
-from ._problem import FitProblem, make_problem
+from ._problem import FitProblem, make_problem, nonzero
 from ._search import (
     AbstractSpread,
     GivenVariances,
@@ -50,16 +50,20 @@ class ErrorByCount(eqx.Module):
             "the least number of Gaussians depends on values; compute it outside of jit and vmap",
         )
         worst = np.max(np.asarray(self.error), axis=1)
-        require(
-            error > 0 and np.any(worst <= error),
-            f"error is {error:g}, and {len(worst)} Gaussians reach {worst[-1]:.2e} (worst "
-            "channel); give a larger error, or allow more Gaussians",
-        )
+        _check_reached(error > 0 and np.any(worst <= error), error, len(worst), worst[-1])
         return int(np.argmax(worst <= error)) + 1
 
     def start(self, count: int) -> GivenVariances:
         """Return the start for a fit of `count` Gaussians that refines this result."""
         return GivenVariances(self.variances[..., count - 1, :count])
+
+
+def _check_reached(is_reached: bool, error: float, count: int, worst: float) -> None:
+    require(
+        is_reached,
+        f"error is {error:g}, and {count} Gaussians reach {worst:.2e} (worst channel); give a "
+        "larger error, or allow more Gaussians",
+    )
 
 
 @jit_unless_traced
@@ -228,8 +232,10 @@ def fit_gaussians(
         # The final refinement of shared variances may move error from one channel to another.
         for trial in range(by_count.least(count.error), count.max_count + 1):
             fitted = _fit_compiled(profile, trial, spread, weights, rule, by_count.start(trial))
-            if float(jnp.max(fitted.error)) <= count.error:
+            worst = float(jnp.max(fitted.error))
+            if worst <= count.error:
                 break
+        _check_reached(worst <= count.error, count.error, trial, worst)
     else:
         check_count("count", count)
         fitted = _fit_compiled(profile, count, spread, weights, rule, start)
@@ -254,7 +260,8 @@ def _fit_compiled(
 
     problem = make_problem(profile, weights, rule)
     (gaussians, error, covariance), converged = spread.over(fit, problem, start)
-    energy = jnp.sum(gaussians.weights, axis=-2).reshape(-1) / profile.total_reflectance() - 1
+    total = profile.total_reflectance()
+    energy = (jnp.sum(gaussians.weights, axis=-2).reshape(-1) - total) / nonzero(total)
     result = optx.RESULTS.where(
         jnp.all(converged), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
     )

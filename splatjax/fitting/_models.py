@@ -159,11 +159,20 @@ def weight_factors(
       material with the wider profile.
     - `other`: the profile of the second material, 1/mm^2.
 
-    **Returns:** one factor for each Gaussian and channel.
+    **Returns:** one factor for each Gaussian and channel; 1 in a channel without weights.
+
+    **Raises:** `ValueError` for negative weights, and for unequal numbers of channels.
     """
     weights = np.asarray(gaussians.weights)
+    channels = other.length_scale().size
+    require(
+        channels == gaussians.channels,
+        f"other has {channels} channels, gaussians have {gaussians.channels}; give equal numbers",
+    )
+    remedy = "at least 0; fit them with NonNegativeWeights(FixedTotalReflectance())"
+    check_values("gaussians.weights", weights, remedy, lambda x: x >= 0)
     factors, has_weight = np.ones_like(weights), weights > 0
-    for used in np.unique(has_weight, axis=1).T:
+    for used in np.unique(has_weight[:, has_weight.any(axis=0)], axis=1).T:
         alike = np.ix_(used, np.all(has_weight == used[:, None], axis=0))
         fitted = np.ones_like(weights)
         fitted[used] = _fit_held(other, gaussians.variances[used])
@@ -224,7 +233,7 @@ def fit_medium(
       standard errors.
     - `start`: start of the search, within a factor of about ten of the result; its `eta` is kept.
     - `beam_variance`: variance of the laser beam per axis, mm^2.
-    - `model`: computes the profile of a medium.
+    - `model`: computes the profile of a medium, which must be finite at the origin.
     - `count`: number of Gaussians.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.
 
@@ -240,6 +249,10 @@ def fit_medium(
         f"{channels} channels; got {measured.deviation} and {start.channels} channels",
     )
     check_values("measured.deviation", measured.deviation, "positive", lambda x: x > 0)
+    require(
+        not model(start).singular,
+        f"model is {model}, whose profile is infinite at the origin; give Dipole or BetterDipole",
+    )
     fitted = _fit_compiled(
         measured,
         start,

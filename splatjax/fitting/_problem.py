@@ -15,6 +15,11 @@ from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule, at_own_radii
 from ._weights import AbstractWeights, invert_moving
 
 
+def nonzero(norm: Float[Array, "*channels"]) -> Float[Array, "*channels"]:
+    """Replace a norm of 0, that of a black channel, by 1, so that its errors are 0."""
+    return jnp.where(norm > 0, norm, 1.0)
+
+
 def norm_radii(
     profile: AbstractProfile, rule: AbstractRadialRule
 ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
@@ -74,9 +79,8 @@ def relative_error(
     """
     r, dr = norm_radii(profile, rule)
     values = at_own_radii(profile, r)
-    return jnp.sqrt(
-        squared_error(profile, gaussians, rule) / jnp.sum(dr * r * values * values, axis=0)
-    )
+    norm = nonzero(jnp.sum(dr * r * values * values, axis=0))
+    return jnp.sqrt(squared_error(profile, gaussians, rule) / norm)
 
 
 class Expansion(eqx.Module):
@@ -249,7 +253,7 @@ def make_problem(
     )
     r, dr = norm_radii(profile, rule)
     values = at_own_radii(profile, r)
-    norm = jnp.sqrt(jnp.sum(dr * r * values * values, axis=0))
+    norm = jnp.sqrt(nonzero(jnp.sum(dr * r * values * values, axis=0)))
     root_weights = jnp.sqrt(dr * r)
     return FitProblem(
         squared_radii=(r * r).T,

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax._records import check_values, numbers, record, require
 from splatjax.scattering import Medium
 
-from ._problem import Expansion, FitProblem
+from ._problem import Expansion, FitProblem, nonzero
 from ._weights import NormalEquations, invert_moving
 
 # Range of log variances (in squared length scales) from which a single Gaussian starts.
@@ -164,7 +164,7 @@ def _descend(
     """Descend from a start, and return the end and its sum of squares."""
     # Divide by the norm of the first residuals, so that damping and tolerances have the same effect
     # for good and poor fits.
-    unit = jnp.sqrt(_cost(problem.residuals(start, active)))
+    unit = jnp.sqrt(nonzero(_cost(problem.residuals(start, active))))
 
     def residuals(point, _):
         return _projected(problem, active, point) / unit
@@ -286,7 +286,7 @@ def refine(
         lambda state: state[2] & (state[3] <= _NEWTON_STEPS), step, state
     )
     floor = (_FLOOR * float(jnp.finfo(start.dtype).eps)) ** 2
-    return point, gain <= _GAIN * cost + floor
+    return point, jnp.isfinite(cost) & (gain <= _GAIN * cost + floor)
 
 
 def _gain(expansion: Expansion) -> Float[Array, ""]:

@@ -65,8 +65,10 @@ class WeightTable(eqx.Module):
             f"values are given for {', '.join(values)}; give {', '.join(self.names)}",
         )
         rows = [as_floats(values[name], self.at_nodes.dtype, name) for name in self.names]
+        slack = 16 * float(jnp.finfo(self.at_nodes.dtype).eps)  # rounding of `values`
         for name, row, (low, high) in zip(self.names, rows, np.asarray(self.limits), strict=True):
             limits = f"between {low:g} and {high:g}, the range of the table"
+            low, high = low - slack * abs(low), high + slack * abs(high)
             check_values(name, row, limits, lambda x, low=low, high=high: (x >= low) & (x <= high))
         points = jnp.stack(jnp.broadcast_arrays(*map(jnp.atleast_1d, rows)), axis=1)
         low, high = self._scaled(self.limits.T)

@@ -16,7 +16,9 @@ from splatjax.fitting import (
     FixedTotalReflectance,
     FreeWeights,
     GivenVariances,
+    LeastCount,
     NonNegativeWeights,
+    SharedVariances,
     VariancesPerChannel,
     _search,
     error_by_count,
@@ -190,6 +192,10 @@ def test_a_profile_without_a_norm_is_refused(dtype):
             partial(function, PhotonBeam(MARBLE_GREEN)),
             r"PhotonBeam .*L2_QUADRATURE.beyond",
         )
+    measured = sj.scattering.Tabulated([0.5, 1.0], [[2.0], [1.0]], [[0.1], [0.1]])
+    start = sj.Medium([0.1], [1.0], 1.3)
+    fit = partial(sj.fitting.fit_medium, measured, start, model=PhotonBeam)
+    assert_refused(fit, "model is .*PhotonBeam.*; give Dipole")
 
 
 def test_beyond_a_cut_a_photon_beam_is_fitted(float64):
@@ -198,6 +204,41 @@ def test_beyond_a_cut_a_photon_beam_is_fitted(float64):
     assert fitted.error[0] < 0.02
     r = jnp.linspace(0.5, 4, 20)
     np.testing.assert_allclose(fitted.gaussians(r), beam(r), atol=0.02 * float(beam(r)[0, 0]))
+
+
+@pytest.mark.parametrize("spread", [SharedVariances(), VariancesPerChannel()])
+def test_a_black_channel_gets_no_weight_and_leaves_the_others_alone(float64, spread):
+    rule = L2_QUADRATURE.beyond(1.0)
+    fits = [
+        fit_gaussians(sj.scattering.Burley(albedo, 1.0), 2, spread=spread, rule=rule)
+        for albedo in ([0.8, 0.0, 0.3], [0.8, 0.3])
+    ]
+    errors, alone = (np.asarray([fit.error, fit.energy_error]) for fit in fits)
+    np.testing.assert_allclose(errors[:, [0, 2]], alone, rtol=1e-6)
+    np.testing.assert_array_equal(errors[:, 1], 0)
+    assert np.all(np.isfinite(fits[0].gaussians.weights))
+
+
+def test_a_profile_that_is_not_finite_does_not_converge(float64):
+    values = np.asarray([[1.0, 1.0], [0.4, 0.3], [0.1, 0.1]])
+    profile = sj.scattering.Tabulated([0.1, 0.5, 1.0], values)
+    broken = eqx.tree_at(lambda p: p.values, profile, profile.values.at[1, 0].set(jnp.nan))
+    fitted = fit_gaussians(broken, 1, throw=False)
+    assert bool(fitted.result != optx.RESULTS.successful)
+
+
+def test_a_count_that_just_misses_its_error_is_refused(float64):
+    least = float(np.max(error_by_count(media("skin1"), 2).error[1]))
+    assert_refused(lambda: fit_gaussians(media("skin1"), LeastCount(least, 2)), "2 Gaussians reach")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["ketchup", "leaf", "shampoo"])
+def test_absorbing_media_that_scatter_forward_are_fitted(float64, name):
+    model = sj.fitting.TransportModel(0.8)
+    profile = model.profile(sj.load_medium(name))
+    weights = NonNegativeWeights(FixedTotalReflectance())
+    assert np.all(fit_gaussians(profile, weights=weights, rule=model.rule).error < 0.1)
 
 
 @pytest.mark.once

@@ -68,6 +68,28 @@ def test_a_gaussian_that_the_base_lacks_keeps_no_weight_and_the_total_is_right(d
     np.testing.assert_allclose(weights[:, 1], [0.2, 0.0], rtol=1e-5)
 
 
+def test_a_black_channel_keeps_the_factor_1():
+    base = sj.SumOfGaussians([0.3, 2.0], [[0.4, 0.0], [0.5, 0.0]])
+    factors = sj.fitting.weight_factors(base, sj.SumOfGaussians(*BASE))
+    np.testing.assert_allclose(factors[:, 1], 1)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [([0.4, -0.1], "gaussians.weights must be .* -0.1"), ([0.4], "other has 2 channels, .* 1")],
+)
+def test_gaussians_that_take_no_factors_are_refused(weights, message):
+    base = sj.SumOfGaussians([0.3], [weights])
+    assert_refused(lambda: sj.fitting.weight_factors(base, sj.SumOfGaussians(*BASE)), message)
+
+
+def test_the_ends_of_a_table_are_inside_of_it_in_float32(float32):
+    nodes = {"dye": np.geomspace(0.002, 0.1, 3), "dirt": np.linspace(-0.3, 0.7, 2)}
+    table = weight_table(dyed, nodes, sj.SumOfGaussians(*BASE))
+    ends = jnp.asarray([[0.0, 0.0], [1.0, 1.0]])
+    np.testing.assert_allclose(table.fractions(table.values(ends)), ends, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("nodes", "message"),
     [
