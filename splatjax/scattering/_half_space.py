@@ -1,6 +1,4 @@
-"""Light transport in a half space by adding and doubling layers over discrete cosines: the
-directional albedo, and the angular law of a material.
-"""
+"""Light transport in a half space by adding and doubling: directional albedo, angular law."""
 
 from collections.abc import Callable
 
@@ -21,8 +19,8 @@ ANGULAR_POWERS = 5  # number of powers in the fitted law
 _HALVINGS = 24  # bisections in the search for a similarity parameter
 _OUTSIDE, _BEYOND = 12, 8  # numbers of cosines: refracted, and beyond the critical angle
 _MOMENTS = 12  # number of moments of the phase function
-_LEAST_COSINE = 1e-4
-_DEPTH = 0.05  # depth of the first layer of a half space, mean free paths
+_LEAST_COSINE, _LEAST_ETA = 1e-4, 1.0003  # the index: for derivatives
+_DEPTH, _DEEPEST = 0.05, 1e4  # of the first layer and of the thickest cover, mean free paths
 _DOUBLINGS, _COVER_DOUBLINGS = 22, 8
 
 
@@ -50,9 +48,8 @@ class AngularLaw(eqx.Module):
             raise ValueError(f"AngularLaw.coefficients has {powers} powers; give 1 to 8")
         if is_traced(self.coefficients) or isinstance(self.coefficients, jax.ShapeDtypeStruct):
             return
-        values = np.vander(np.linspace(0, 1, 33), powers, increasing=True) @ np.asarray(
-            self.coefficients
-        )
+        rows = np.vander(np.linspace(0, 1, 33), powers, increasing=True)
+        values = rows @ np.asarray(self.coefficients)
         check_values(
             "AngularLaw.coefficients, summed",
             values[-1],
@@ -90,10 +87,9 @@ class HalfSpace(eqx.Module):
     computed by light transport, without the diffusion approximation.
 
     The method is adding and doubling: the reflection and transmission of a layer over discrete
-    cosines give the operators of two such layers, and so on until the layers form a half space. The
-    surface, with its internal reflection, is added last. The result does not depend on the division
-    into layers, so the first layer may be thick. The phase function is Henyey-Greenstein; its
-    forward peak beyond the twelfth moment counts as unscattered (delta-M).
+    cosines give those of two such layers, until they form a half space; the surface is added last.
+    The phase function is Henyey-Greenstein; its forward peak beyond the twelfth moment counts as
+    unscattered (delta-M).
 
     **Attributes:** (differentiable)
 
@@ -123,10 +119,10 @@ class HalfSpace(eqx.Module):
         r"""Find the half space that has a given color, to convert materials of other renderers.
         This is the inverse of the method `color`.
 
-        For OpenPBR, `color` is `subsurface_color`, `mean_free_path` is the product of
-        `subsurface_radius` and `subsurface_radius_scale` in mm, `eta` is `specular_ior`, and `g` is
-        `subsurface_scatter_anisotropy`. For Blender's Principled BSDF with random walk, they are
-        base color, radius times scale, IOR and anisotropy.
+        For OpenPBR, the arguments are `subsurface_color`, `subsurface_radius` times
+        `subsurface_radius_scale` in mm, `specular_ior` and `subsurface_scatter_anisotropy`; for
+        Blender's Principled BSDF with random walk, base color, radius times scale, IOR and
+        anisotropy.
 
         **Arguments:** (one number for all channels, or one for each; differentiable except at a
         color of 1)
@@ -140,7 +136,8 @@ class HalfSpace(eqx.Module):
 
         **Raises:** `ValueError` for a number out of its range, and for unequal numbers of channels.
         """
-        arrays = [jnp.atleast_1d(as_floats(value)) for value in (color, mean_free_path, eta, g)]
+        given, dtype = (color, mean_free_path, eta, g), as_floats(color).dtype
+        arrays = [jnp.atleast_1d(as_floats(value, dtype)) for value in given]
         sizes = [array.size for array in arrays]
         if len({*sizes} - {1}) > 1:
             raise ValueError(f"color, mean_free_path, eta, g have sizes {sizes}; give equal sizes")
@@ -180,10 +177,9 @@ class HalfSpace(eqx.Module):
     def _by_channel(self, fraction: Callable[..., Array]) -> Float[Array, "channels *angles"]:
         """Compute a fraction of each channel from `1 - albedo'`, `eta`, `g` and the cover."""
         medium, cover = self.medium, self.cover
-        layer = cover and (
-            cover.medium.sigma_a / cover.medium.sigma_t_prime,
-            cover.medium.sigma_t_prime * cover.thickness,
-        )
+        if layer := cover and cover.medium:
+            thickness = jnp.minimum(cover.thickness, _DEEPEST / layer.sigma_t_prime)
+            layer = layer.sigma_a / layer.sigma_t_prime, layer.sigma_t_prime * thickness
         # One channel at a time: if all were batched, XLA would never finish compiling a fit.
         inputs = medium.sigma_a / medium.sigma_t_prime, medium.eta, self.g, layer
         return jax.lax.map(lambda channel: fraction(*channel), inputs)
@@ -227,7 +223,8 @@ def _similarity_of_color(
     return root.value
 
 
-def _directional_albedo(absorbed, eta, g, cover=None) -> Float[Array, " angles"]:
+@jax.custom_jvp
+def _directional_albedo(absorbed, eta, g, cover) -> Float[Array, " angles"]:
     """Compute the fraction of light, entering at each of `HalfSpace.cosines`, that leaves a half
     space. `absorbed` is `1 - albedo'`; `cover` is that of the cover and its reduced optical depth.
     """
@@ -247,10 +244,15 @@ def _directional_albedo(absorbed, eta, g, cover=None) -> Float[Array, " angles"]
     return leaving[: _OUTSIDE + 1, 0]
 
 
+@_directional_albedo.defjvp
+def _directional_albedo_jvp(primals, tangents):
+    absorbed, eta, *others = primals  # near eta = 1 no cosine resolves the critical angle
+    primals = absorbed, jnp.maximum(eta, _LEAST_ETA), *others
+    return jax.jvp(_directional_albedo.fun, primals, tangents)
+
+
 def _doubled(mu, weights, absorbed, g, optical_depth=None):
-    """Compute the transmission and reflection between all cosines, for a layer of a given reduced
-    optical depth or for a half space.
-    """
+    """Compute transmission and reflection between all cosines, for a layer or a half space."""
     even, odd, albedo, lost, extinction = _redistribution(mu, weights, absorbed, g)
     doublings = _DOUBLINGS if optical_depth is None else _COVER_DOUBLINGS
     depth = _DEPTH if optical_depth is None else optical_depth * extinction / 2**doublings
@@ -308,9 +310,8 @@ def _directions(eta: Float[Array, ""]):
 
 
 def _redistribution(mu, weights, absorbed, g):
-    """Compute the even and odd parts of the phase function between all cosines, times their
-    weights, and then the albedo, `1 - albedo` and the relative extinction, all with the peak
-    unscattered.
+    """Compute the even and odd parts of the phase function between all cosines, times weights, and
+    the albedo, `1 - albedo` and the relative extinction, all with the peak unscattered.
     """
     polynomials = [jnp.ones_like(mu), mu]
     for n in range(1, _MOMENTS - 1):

@@ -162,6 +162,58 @@ def test_a_photon_beam_takes_the_total_of_transport():
     np.testing.assert_allclose(ratio[0], ratio[1], rtol=1e-4)
 
 
+@pytest.mark.parametrize("g", [-0.95, -0.5, 0.3, 0.8, 0.95])
+def test_multiple_scattering_is_positive_whatever_the_phase_function(g):
+    """In half spaces from almost black to white."""
+    for eta in (1.0, 1.4, 2.5):
+        space = half_space([1e-3, 0.03, 0.2, 0.5, 0.9, 1.0], eta, g)
+        beam = sj.fitting.TransportModel(g).profile(space.medium)
+        assert np.all(np.asarray(beam.strength) > 0.1)
+        assert np.all(np.asarray(beam.single) > 0)
+        np.testing.assert_allclose(beam.total_reflectance(), space.total_reflectance(), rtol=2e-5)
+
+
+@pytest.mark.once
+def test_single_scattering_that_exceeds_the_total_cannot_be_separated():
+    medium, model = sj.Medium([0.1, 2.0], [1.0, 1.0], 1.4), sj.fitting.TransportModel(0.8)
+    assert_refused(model.profile(medium).multiply_scattered, "strength .* positive.* at .1.")
+    rest = model.profile(sj.Medium([0.1], [1.0], 1.4)).multiply_scattered().total_reflectance()
+    total = (
+        HalfSpace(medium, 0.8).total_reflectance() - SingleScattering(medium).total_reflectance()
+    )
+    np.testing.assert_allclose(rest, total[:1], rtol=1e-5)
+
+
+def test_its_derivative_at_matched_indices_is_that_from_above(float64):
+    space = jax.jit(lambda eta: half_space([0.5, 0.99], eta, 0.6))
+    for fraction in (HalfSpace.total_reflectance, HalfSpace.color):
+        found = jax.jacfwd(lambda eta, of=fraction: of(space(eta)))(1.0)
+        expected = (fraction(space(1.001)) - fraction(space(1.0))) / 1e-3
+        np.testing.assert_allclose(found, expected, rtol=0.15)
+
+
+def test_an_infinite_cover_is_a_half_space(float64):
+    black = half_space(1e-6, 1.0, 0.5).medium
+
+    @jax.jit
+    @jax.value_and_grad
+    def total(sigma_a, thickness):
+        cover = sj.Medium(sigma_a, 1.0, 1.0)
+        space = HalfSpace(cover, 0.5)
+        if thickness is not None:
+            space = HalfSpace(black, 0.5, sj.Layer(cover, thickness))
+        return space.total_reflectance()[0]
+
+    for thickness in (jnp.inf, 1e6):
+        np.testing.assert_allclose(total(0.1, thickness), total(0.1, None), rtol=1e-4)
+
+
+def test_a_color_in_float32_is_found_in_double_precision_too(float64):
+    space = HalfSpace.of_color(np.float32([0.5]), 1.0)
+    white = HalfSpace(sj.Medium([0.0], [1.0], 1.4)).color()
+    np.testing.assert_allclose(space.color(), 0.5 * white, rtol=1e-4)
+
+
 @pytest.mark.long
 @pytest.mark.once
 def test_a_flat_piece_sends_back_what_the_law_says():
