@@ -13,6 +13,7 @@ import scipy  # submodules load on first use, which takes a third of a second
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import jit_unless_traced
+from splatjax._memory import check_memory
 from splatjax._records import as_floats, check_values
 from splatjax.fitting import WeightTable
 from splatjax.geometry import tangent_frames
@@ -49,6 +50,8 @@ class SurfaceMean(eqx.Module):
         tree = scipy.spatial.KDTree(centers)
         reach = _REACH * width
         most = int(np.max(tree.query_ball_point(centers, reach, return_length=True)))
+        what = f"a mean over up to {most} neighbors of each splat, within {reach:g} mm,"
+        check_memory(what, 64.0 * most * len(areas), "give a smaller smoothness, or fewer splats")
         order = np.arange(1, -(-most // _ROUNDED) * _ROUNDED + 1)
         distances, near = tree.query(centers, k=order, distance_upper_bound=reach, workers=-1)
         counts = near < len(areas)

@@ -41,7 +41,7 @@ def _shared_walks(media: LayeredMedia) -> list[np.ndarray]:
 
 def monte_carlo(
     layers: Sequence[Layer | Film],
-    photons: int,
+    photons: int | float,
     key: Key[Array, ""],
     *,
     edges: Numbers | None = None,
@@ -95,7 +95,7 @@ def monte_carlo(
             f"at least {least}, and below 2^30",
             lambda x, least=least: (x >= least) & (x < 2**30),
         )
-    layers = tuple(layers)
+    photons, layers = int(photons), tuple(layers)
     check_stack(layers)
     dtype = next(layer.medium.sigma_a.dtype for layer in layers if isinstance(layer, Layer))
     above, below, g = (as_floats(values, dtype) for values in (eta_above, eta_below, g))

@@ -83,7 +83,7 @@ def finish(
     to the absorption of each layer, then the scattering of each layer.
     """
     state = _start(walk, with_slopes)
-    if is_traced(state.started):
+    if is_traced(walk):
         state = jax.lax.while_loop(
             lambda state: state.unfinished(walk), lambda state: _round(walk, state), state
         )

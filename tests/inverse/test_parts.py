@@ -297,6 +297,12 @@ def test_a_ball_that_grows_stays_a_ball():
     np.testing.assert_allclose(moved.radii, 1.1 * ball.radii, rtol=1e-2)
 
 
+def test_a_mean_over_too_many_neighbors_is_refused(monkeypatch):
+    monkeypatch.setattr("splatjax._memory.free_bytes", lambda: 1e6)
+    part = sj.inverse.NormalOffsets(step=0.5, smoothness=30.0, deviation=1.0)
+    assert_refused(lambda: part.prepared(sphere(400)), "400 neighbors.*give a smaller smoothness")
+
+
 @pytest.mark.once
 def test_offsets_are_means_of_coordinates_over_the_same_side_of_a_sheet():
     """The prior: coordinates that make offsets of its deviation cost one each."""

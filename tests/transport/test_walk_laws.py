@@ -108,6 +108,17 @@ def test_channels_that_walk_alike_are_walks_of_their_own(float32):
     assert np.all(np.diff(slab.total_transmittance.value) < -0.05)
 
 
+@pytest.mark.once
+def test_batches_of_media_are_walks_of_each(float32):
+    def total(sigma_a):
+        layers = [layer(sigma_a, 1.0, 1.3, jnp.inf)]
+        return sj.transport.monte_carlo(layers, 1e4, KEY).total_reflectance
+
+    absorptions = jnp.asarray([0.1, 0.4])
+    expected = jax.tree.map(lambda *rows: jnp.stack(rows), *map(total, absorptions))
+    agree(jax.vmap(total)(absorptions), expected)
+
+
 def test_a_film_is_a_thin_layer_that_absorbs(float32):
     thin, below = 1e-3, layer(0.05, 2.0, 1.4, 2.0)
     film = sj.transport.monte_carlo([sj.Film([0.3]), below], PHOTONS, KEY)
