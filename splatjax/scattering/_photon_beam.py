@@ -192,7 +192,8 @@ class PhotonBeam(AbstractHalfSpace):
         """
         single = SingleScattering(self.medium, self.single).total_reflectance()
         multiple = _MultipleScattering(self.medium, self.fresnel).total_reflectance()
-        strength = (jnp.asarray(total) - single) / multiple
+        total = jnp.asarray(total)
+        strength = (total - single) / multiple
         added = jnp.maximum(_LEAST_PART * total / (single + multiple) - strength, 0)
         factor = self.single * (1 - added * multiple / single)
         return PhotonBeam(self.medium, self.fresnel, strength + added, factor)
