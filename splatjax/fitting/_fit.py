@@ -50,7 +50,7 @@ class ErrorByCount(eqx.Module):
             "the least number of Gaussians depends on values; compute it outside of jit and vmap",
         )
         worst = np.max(np.asarray(self.error), axis=1)
-        _check_reached(error > 0 and np.any(worst <= error), error, len(worst), worst[-1])
+        _check_reached(error > 0 and bool(np.any(worst <= error)), error, len(worst), worst[-1])
         return int(np.argmax(worst <= error)) + 1
 
     def start(self, count: int) -> GivenVariances:

@@ -177,9 +177,10 @@ class HalfSpace(eqx.Module):
     def _by_channel(self, fraction: Callable[..., Array]) -> Float[Array, "channels *angles"]:
         """Compute a fraction of each channel from `1 - albedo'`, `eta`, `g` and the cover."""
         medium, cover = self.medium, self.cover
-        if layer := cover and cover.medium:
-            thickness = jnp.minimum(cover.thickness, _DEEPEST / layer.sigma_t_prime)
-            layer = layer.sigma_a / layer.sigma_t_prime, layer.sigma_t_prime * thickness
+        layer = cover and (
+            cover.medium.sigma_a / cover.medium.sigma_t_prime,
+            jnp.minimum(cover.medium.sigma_t_prime * cover.thickness, _DEEPEST),
+        )
         # One channel at a time: if all were batched, XLA would never finish compiling a fit.
         inputs = medium.sigma_a / medium.sigma_t_prime, medium.eta, self.g, layer
         return jax.lax.map(lambda channel: fraction(*channel), inputs)
