@@ -181,9 +181,8 @@ class HalfSpace(eqx.Module):
             cover.medium.sigma_a / cover.medium.sigma_t_prime,
             jnp.minimum(cover.medium.sigma_t_prime * cover.thickness, _DEEPEST),
         )
-        # One channel at a time: if all were batched, XLA would never finish compiling a fit.
         inputs = medium.sigma_a / medium.sigma_t_prime, medium.eta, self.g, layer
-        return jax.lax.map(lambda channel: fraction(*channel), inputs)
+        return jax.lax.map(lambda channel: fraction(*channel), inputs)  # batched compiles too long
 
     @jit_unless_traced
     def angular_law(self, separate: Float[Array, "angles channels"] | None = None) -> AngularLaw:
