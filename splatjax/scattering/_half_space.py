@@ -179,7 +179,8 @@ class HalfSpace(eqx.Module):
         medium, cover = self.medium, self.cover
         layer = cover and (
             cover.medium.sigma_a / cover.medium.sigma_t_prime,
-            jnp.minimum(cover.medium.sigma_t_prime * cover.thickness, _DEEPEST),
+            cover.medium.sigma_t_prime
+            * jnp.minimum(cover.thickness, _DEEPEST / cover.medium.sigma_t_prime),
         )
         inputs = medium.sigma_a / medium.sigma_t_prime, medium.eta, self.g, layer
         return jax.lax.map(lambda channel: fraction(*channel), inputs)  # batched compiles too long
@@ -225,9 +226,7 @@ def _similarity_of_color(
 
 @jax.custom_jvp
 def _directional_albedo(absorbed, eta, g, cover) -> Float[Array, " angles"]:
-    """Compute the fraction of light, entering at each of `HalfSpace.cosines`, that leaves a half
-    space. `absorbed` is `1 - albedo'`; `cover` is that of the cover and its reduced optical depth.
-    """
+    """Compute `HalfSpace.directional_albedo` from `1 - albedo'`, and that and the depth of a cover."""
     mu, weights, reflected = _directions(eta)
     half_space = _doubled(mu, weights, absorbed, g)[1]
     identity = jnp.eye(len(mu), dtype=mu.dtype)
