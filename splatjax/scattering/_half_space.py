@@ -226,7 +226,7 @@ def _similarity_of_color(
 
 @jax.custom_jvp
 def _directional_albedo(absorbed, eta, g, cover) -> Float[Array, " angles"]:
-    """Compute `HalfSpace.directional_albedo` from `1 - albedo'`, and that and the depth of a cover."""
+    """Compute the directional albedo from `1 - albedo'`, and that and the depth of a cover."""
     mu, weights, reflected = _directions(eta)
     half_space = _doubled(mu, weights, absorbed, g)[1]
     identity = jnp.eye(len(mu), dtype=mu.dtype)
