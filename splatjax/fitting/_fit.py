@@ -185,7 +185,16 @@ def fit_gaussians(
     rule: AbstractRadialRule = L2_QUADRATURE,
     throw: bool = True,
 ) -> FitResult:
-    r"""Fit a sum of Gaussians to a profile: minimize Eq. 3 over variances and weights.
+    r"""Fit a sum of Gaussians to a profile.
+
+        model, medium = TransportModel(), load_medium("marble")
+        weights = NonNegativeWeights(FixedTotalReflectance())
+        fitted = fit_gaussians(model.profile(medium), 6, weights=weights, rule=model.rule)
+        fitted.gaussians, fitted.error
+
+    This is the fit of `splatjax fit`, and of `Material.of_medium`. With the default `weights` and
+    `rule`, the fit minimizes the integral of `r (R(r) - sum_k w_k G(v_k, r))^2` (Eq. 3) over the
+    variances `v` and the weights `w`.
 
     The method is variable projection: for given variances the best weights solve a linear problem,
     and the Levenberg-Marquardt method searches the logarithms of the variances. By default the
@@ -203,13 +212,14 @@ def fit_gaussians(
     - `profile`: 1/mm^2; the integral of `r R(r)^2` must exist. Differentiable.
     - `count`: number of Gaussians, at least 1; or `LeastCount(error)` for the least number that
       reaches an error.
-    - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
+    - `spread`: `SharedVariances()` (default), which a `Material` needs, or `VariancesPerChannel()`.
     - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, which conserves the energy,
       or `NonNegativeWeights(among)`, which also excludes negative weights.
     - `start`: `GivenVariances(...)` near those of the best fit, for a single fast search; requires
       a fixed count. By default, fits with fewer Gaussians provide the start.
-    - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for
-      a profile with standard errors.
+    - `rule`: the radii of the integral, and their weights. The default covers all radii;
+      `TransportModel.rule` starts at half a mean free path; `InverseVariance()` weights a measured
+      profile by its standard errors.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.
 
     **Returns:** a `FitResult`. Its `error` and weights do not depend on the unit of length.

@@ -83,7 +83,8 @@ class TransportModel(AbstractModel):
         fitted = fit_gaussians(model.profile(medium), weights=weights, rule=model.rule)
         material = Material(fitted.gaussians, eta=1.3, angles=model.angles(medium))
 
-    Single scattering is that of the phase function.
+    `g` affects the total, the angular law and single scattering; the shape of multiple scattering
+    is that of isotropic scattering.
 
     `rule` starts at half a mean free path, because splats hardly resolve smaller radii. It weights
     radii by their fifth power, so that the fit is accurate deep inside a shadow.

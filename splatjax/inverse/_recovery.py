@@ -216,16 +216,16 @@ class Recovery(AbstractEstimate):
         stretch: float = 1.0,
     ) -> Float[np.ndarray, "channels 2 2"]:
         """Compute the covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each
-            channel, marginalized over the other unknowns.
+        channel, marginalized over the other unknowns.
 
-            It is the sum of the covariance due to noise and the square of the change of the
-            coefficients if the width below which layers are unresolved changes by one standard
-            deviation (`resolution`).
+        It is the sum of the covariance due to noise and the square of the change of the
+        coefficients if the width below which layers are unresolved changes by one standard
+        deviation (`resolution`).
 
-            **Arguments:**
+        **Arguments:**
 
-            - `more`: information that another picture would add.
-            - `resolution`: the standard deviation of the logarithm of that width; 0 if exact.
+        - `more`: information that another picture would add.
+        - `resolution`: the standard deviation of the logarithm of that width; 0 if exact.
         - `stretch`: factor of the covariance due to noise.
         """
         channels, scale = self.medium.channels, max(self.scale * stretch, np.finfo(float).tiny)

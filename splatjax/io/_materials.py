@@ -85,8 +85,9 @@ def material_path(name_or_path: StrPath) -> Path:
 def load_material(name_or_path: StrPath | Table) -> Material:
     r"""Load the fitted Gaussians and the surface of a material.
 
-    **Arguments:** `name_or_path`: one of `list_materials()`, the path of a TOML file, or its
-    contents as a `Table`.
+        load_material("skin").white()  # for splats whose albedo gives the color
+
+    **Arguments:** `name_or_path`: one of `list_materials()`, a TOML file, or a `Table` of one.
 
     **Returns:** a `Material` in JAX's default precision; variances in mm^2, ascending.
 

@@ -95,7 +95,7 @@ def picture_jacobian(
 
     The derivatives are those of the picture that `render` computes, with its approximations. They
     equal those of reverse mode, pixel by pixel, and take less than two and a half times as long as
-    `render`, for any number of pixels or parameters. Gauss and Newton's method for least squares
+    `render`, for any number of pixels or parameters. The Gauss-Newton method for least squares
     needs them; `through` continues them to optical coefficients.
 
     **Arguments:** as for `render`; under `jit` a plan is needed. With `ClusterDiffuser`, it cannot

@@ -17,10 +17,13 @@ from ._quadrature import unit_interval
 
 @record
 class Medium(eqx.Module):
-    r"""The optical coefficients of a homogeneous material.
+    r"""The optical coefficients of a homogeneous material. `Material.of_medium` makes a material of
+    them.
 
         Medium([0.020, 0.006, 0.015], [1.1, 1.3, 1.5], eta=1.6)
         Medium((1 - albedo) * sigma_t, albedo * sigma_t * (1 - g), eta)  # of extinction and albedo
+
+    Divide coefficients in 1/cm by 10.
 
     **Attributes:** (any number of channels; a single number applies to all; differentiable)
 

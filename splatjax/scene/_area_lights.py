@@ -106,16 +106,23 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
 
 @record
 class RectangleLight(AbstractAreaLight):
-    r"""A rectangle of uniform radiance that emits from one side, such as a softbox.
+    r"""A rectangle of uniform radiance that emits from one side, such as a softbox. Its size makes
+    shadows soft.
+
+        softbox = RectangleLight.facing((-250, 150, 350), (0, -40, 0), 200, 200, radiance=6)
+
+    `facing` turns a rectangle of a given width and height towards a target.
 
     **Attributes:**
 
     - `center`: mm. Differentiable.
-    - `radiance`: radiance of the emitting side; a white diffuser under a whole sky of radiance L
-      has radiance L. Differentiable.
+    - `radiance`: radiance of the emitting side. Far away, the irradiance is the radiance times the
+      visible area divided by the squared distance. Differentiable.
     - `edges`: two perpendicular edge vectors, mm. The rectangle is centered at `center` and emits
       in the direction of their cross product. Differentiable.
-    - `count`: number of samples, each with a shadow map if `cast_shadows`. Both static.
+    - `count`: number of points that represent the rectangle; more points give smoother penumbras
+      and take longer. Static.
+    - `cast_shadows`: whether each point has a shadow map. Static.
     """
 
     edges: Float[Array, "2 3"] = eqx.field(converter=numbers)
@@ -149,7 +156,11 @@ class RectangleLight(AbstractAreaLight):
         """Make a rectangle that faces a target, with a horizontal lower edge. Straight above or
         below the target, the lower edge is along x.
 
-        **Arguments:** mm; `settings` are `count` and `cast_shadows`.
+        **Arguments:**
+
+        - `center`, `target`, `width`, `height`: mm.
+        - `radiance`: one number, or one per channel.
+        - `settings`: `count` and `cast_shadows`.
         """
         center = as_floats(center)
         right, down = _across(as_floats(target) - center)
@@ -189,7 +200,9 @@ class RectangleLight(AbstractAreaLight):
 class DiskLight(AbstractAreaLight):
     r"""A disk of uniform radiance that emits from one side.
 
-    **Attributes:** `center`, `radiance`, `count` and `cast_shadows` as of `RectangleLight`, and
+        lamp = DiskLight((0, 300, 200), radiance=20, direction=(0, -1, -1), radius=40)
+
+    **Attributes:** `center`, `radiance`, `count` and `cast_shadows` as for `RectangleLight`, and
 
     - `direction`: normal of the emitting side, of any nonzero length. Differentiable.
     - `radius`: mm. Differentiable.

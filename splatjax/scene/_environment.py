@@ -28,17 +28,17 @@ _ROUGHNESSES = np.geomspace(0.05, 1.0, 7)  # roughnesses of the blurred maps
 class EnvironmentLight(AbstractExtendedLight):
     r"""Distant light from all directions, given by an image.
 
-    The image is a latitude-longitude map as OpenEXR defines it, with square pixels, seen from
-    inside the sphere. Its rows run from +y at the top to -y at the bottom. Its columns run from -z
-    through +x, +z (in the middle) and -x back to -z.
-
         sky = EnvironmentLight(overcast_sky(), rotation=30, strength=0.5)
+        place = io.load_environment("place.hdr", rotation=30)  # a file
 
-    The light is sampled by `count` directions. The sphere is divided into parts of equal
-    importance, weighted 90% by light (radiance times solid angle) and 10% by solid angle alone, so
-    that no direction is far from a sample. Each sample carries the light of its part, comes from
-    the mean direction of that light, and has its own shadow map. Highlights are not sampled; glossy
-    surfaces reflect the image, blurred by the lobe.
+    The image is a latitude-longitude map as OpenEXR defines it, with square pixels. The middle of
+    the image is the front (+z), its left and right edges are the back (-z), and +x is halfway
+    between the left edge and the middle. The upper edge is +y, the lower edge -y.
+
+    The image is divided into `count` parts, and each part becomes one distant light with a shadow
+    map: more parts give smoother shadows and take longer. Bright regions have more parts, but dark
+    ones have some, so that no direction is far from a light. Highlights do not use the parts;
+    glossy surfaces reflect the image, blurred by the lobe.
 
     **Attributes:**
 

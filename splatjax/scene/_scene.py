@@ -298,8 +298,8 @@ class Frame(eqx.Module):
       weight.
     - `weights`: the weights with which the layers add up to `diffuse`.
     - `diffuse`, `specular`: radiance.
-    - `unresolved_fraction`: fraction of each layer that the splats do not resolve, averaged over
-      the covered pixels; this fraction is replaced by the irradiance at the surface point.
+    - `unresolved_fraction`: how far each layer is too narrow for the splats, from 0 to 1, averaged
+      over the covered pixels. This fraction of the layer is not blurred: it is the irradiance.
     - `single_scattering`: radiance, premultiplied; `None` if the material has none.
     - `overflow`: 0 if the capacity of the plan suffices. Otherwise it is the largest ratio of
       needed to planned capacity, and the picture is NaN.

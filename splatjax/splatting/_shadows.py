@@ -30,25 +30,26 @@ _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 
 @record
 class ShadowSettings(eqx.Module):
-    r"""Settings of shadow maps and of the comparison with them. Static, but for the last.
+    r"""Settings of shadow maps and of the comparison with them. All are static except `filled`.
+
+    For sharper edges, raise `resolution` and `pixels_per_spacing`. For shadows closer to a contact,
+    lower `bias` and `softness`. If a surface shadows itself, raise `bias`.
 
     **Attributes:**
 
-    - `resolution`: pixels along a side of each map, at most.
-    - `pixels_per_spacing`: most pixels of the map per spacing of the splats, because a finer map
-      would show single discs instead of the body. The resulting size is rounded up, to one of two
-      sizes per octave (`filled`), and is at least 64. `inf` for the full resolution.
-    - `bias`: up to this distance behind the surface of the map a splat is fully lit, so that a
-      surface does not shadow itself. The unit of `bias` and `softness` is the reach of a splat,
-      `sqrt(radius^2 + diagonal^2)`: the radius of the splat, or of its merged disc, and the
+    - `resolution`: largest number of pixels along a side of each map.
+    - `pixels_per_spacing`: largest number of pixels of the map per spacing of the splats; a finer
+      map would show single discs instead of the body. `inf` for the full resolution. The size is
+      rounded up to one of two sizes per octave, and is at least 64.
+    - `bias`: a splat up to this distance behind the surface of the map is fully lit. The unit is
+      `sqrt(radius^2 + diagonal^2)`, with the radius of the splat, or of its merged disc, and the
       diagonal of a pixel of the map at its depth.
-    - `softness`: beyond `bias` the light fades to 0 over this distance, so that shadows have
-      gradients with respect to depth. Across the edge of a shadow, light fades over about two
-      pixels of the map.
-    - `compared`: a splat is compared with a square of this many pixels a side, 2 or 3.
-    - `merged_spacing`: largest spacing of merged discs, in pixels of the map. Neighboring splats
-      are merged to discs of 8, 16 or 32, the most that this spacing allows; 0 merges none. Splats
-      that are farther apart than about a third of it are not merged.
+    - `softness`: beyond `bias`, the light fades to 0 over this distance, in the same unit, so that
+      shadows have gradients with respect to depth. Across the edge of a shadow, light fades over
+      about two pixels of the map.
+    - `compared`: a splat is compared with 2 x 2 or 3 x 3 pixels of the map.
+    - `merged_spacing`: largest spacing of merged discs, in pixels of the map; 0 merges no splats.
+      Each disc replaces 8, 16 or 32 neighboring splats, the most for which it fits.
     - `largest_slope`: the slope up to which the receiver's plane is continued from pixel to pixel
       of the map. On heads, 4 leaves steps at grazing light, and more than 8 has no effect.
     - `filled`: side, in pixels, of the part of the map that shows the body. `None` to derive it.

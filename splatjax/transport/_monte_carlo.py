@@ -55,6 +55,10 @@ def monte_carlo(
     r"""Compute a profile by random walks of photons through layers of any thickness and absorption.
     It is the reference for all other models.
 
+        found = monte_carlo([Layer(load_medium("skin1"), jnp.inf)], 1_000_000, jax.random.key(0))
+        found.total_reflectance.value, found.total_reflectance.deviation  # [channels], with errors
+        found.profile()  # a profile with error bars, to fit
+
     Photons move from one scattering event to the next, absorption reduces their weight, and
     interfaces reflect or refract them by Fresnel's equations. Channels that differ only in
     absorption and in scale, such as those of a half space with one index, share their walks and
