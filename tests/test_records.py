@@ -173,10 +173,6 @@ def test_traced_values_and_placeholders_pass_through_transformations():
             lambda: sj.Camera([0, 0, 9], [[2, 0, 0], [0, 5, 0], [0, 0, 1]], 1, 2, 2),
             "Camera.rotation.* 3 at",
         ),
-        (
-            lambda: sj.scene.RectangleLight([9, 0, 0], 1, [[0, 1, 0], [0, 1, 1]]),
-            r"RectangleLight\.edges .* 0\.7",
-        ),
         (lambda: splats().scaled(np.nan), "scale must be positive; got nan"),
         (lambda: camera([0, 0, 1e25]), r"e\+2[45]"),
         (lambda: camera([0, 0, np.nan]), "nan"),

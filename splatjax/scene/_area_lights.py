@@ -17,7 +17,6 @@ from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSamp
 from ._scene import rotation_towards
 
 _GRAZING = 1e-3  # least cosine between a mirrored ray and the normal of an emitter
-_PERPENDICULAR = 1e-3  # greatest cosine between the edges of a rectangle
 _RIM = 16  # number of points on the rim of a disk
 _GOLDEN = (5**0.5 - 1) / 2
 
@@ -118,8 +117,9 @@ class RectangleLight(AbstractAreaLight):
     - `center`: mm. Differentiable.
     - `radiance`: radiance of the emitting side. Far away, the irradiance is the radiance times the
       visible area divided by the squared distance. Differentiable.
-    - `edges`: two perpendicular edge vectors, mm. The rectangle is centered at `center` and emits
-      in the direction of their cross product. Differentiable.
+    - `edges`: two edge vectors, mm, perpendicular to each other: highlights are wrong otherwise.
+      The rectangle is centered at `center` and emits in the direction of their cross product.
+      Differentiable.
     - `count`: number of points that represent the rectangle; more points give smoother penumbras
       and take longer. Static.
     - `cast_shadows`: whether each point has a shadow map. Static.
@@ -135,12 +135,6 @@ class RectangleLight(AbstractAreaLight):
                 self.normal_and_area()[1],
                 "two vectors that span an area; the area is 0",
                 lambda area: area > 0,
-            )
-            check_values(
-                "the cosine between RectangleLight.edges",
-                jnp.vdot(*self.edges) / jnp.prod(jnp.linalg.norm(self.edges, axis=1)),
-                "0: edges are perpendicular",
-                lambda cosine: np.abs(cosine) < _PERPENDICULAR,
             )
 
     @classmethod
