@@ -238,6 +238,7 @@ def test_even_light_has_no_contrast_and_a_checkered_one_has_all():
     np.testing.assert_allclose(checkered, 1, rtol=0.02)
 
 
+@pytest.mark.once
 def test_thinning_keeps_the_factors_of_all_splats():
     ball = bodies.sphere(300, 10.0)
     factors = 1 + 0.5 * jnp.sin(ball.centers[:, :1])[:, None]  # [splats, gaussians, channels]
