@@ -147,7 +147,7 @@ def _call(cls: type) -> str:
 
 def as_floats(values: Numbers, dtype: DTypeLike | None = None, name: str = "values") -> Array:
     """Convert numbers to a strongly typed array of floats, by default in their own precision."""
-    dtype = dtype or _precision(values)
+    dtype = dtype or precision_of(values)
     if isinstance(values, jax.Array) and values.dtype == dtype and not values.weak_type:
         return values
     try:
@@ -223,7 +223,7 @@ def _converted(
 ) -> dict[str, Array]:
     """Convert the values of all fields of `numbers`."""
     inputs = {name: values[name] for name in axes if not _is_placeholder(values[name])}
-    precision = _precision([records, list(inputs.values())])
+    precision = precision_of([records, list(inputs.values())])
     arrays = {
         name: as_floats(value, precision, f"{record}.{name}") for name, value in inputs.items()
     }
@@ -260,7 +260,7 @@ def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) 
     return array
 
 
-def _precision(tree: Any) -> Any:
+def precision_of(tree: Any) -> Any:
     """Return the dtype of the first floating-point array, at least float32, or JAX's default."""
     for leaf in jax.tree.leaves(tree):
         is_strong = isinstance(leaf, jax.Array | np.ndarray) and not getattr(

@@ -10,7 +10,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, numbers, record, valid
+from splatjax._records import (
+    Numbers,
+    as_floats,
+    check_values,
+    numbers,
+    precision_of,
+    record,
+    valid,
+)
 
 
 def gaussian(
@@ -50,9 +58,15 @@ class AbstractProfile(eqx.Module):
     singular: ClassVar[bool] = False
     has_separate_channels: ClassVar[bool] = False
 
+    def __call__(self, r: Numbers) -> Float[Array, "*radii channels"]:
+        """Compute the profile at distance `r` (mm) from the point where light enters, 1/mm^2. `r`
+        may be a number, a list, or an array of any shape.
+        """
+        return self.evaluate(as_floats(r, precision_of([r, self]), "r"))
+
     @abc.abstractmethod
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        """Compute the profile at distance `r` (mm) from the point where light enters, 1/mm^2."""
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+        """Compute the profile at an array of distances, for `profile(r)`."""
 
     @abc.abstractmethod
     def total_reflectance(self) -> Float[Array, " channels"]:
@@ -97,7 +111,7 @@ class SumOfGaussians(AbstractProfile):
         return self.weights.shape[-1]
 
     @jit_unless_traced
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         variances = self.variances.reshape(*[1] * r.ndim, -1)
         return jnp.dot(gaussian(variances, (r * r)[..., None]), self.weights)
 

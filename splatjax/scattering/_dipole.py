@@ -59,7 +59,7 @@ class AbstractDipole(AbstractHalfSpace):
         """
 
     @jit_unless_traced
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         shape = (*r.shape, self.medium.channels)
         squared_radius = jnp.broadcast_to((r * r)[..., None], shape)
         depth = jnp.broadcast_to(self.length_scale(), shape)
@@ -261,7 +261,7 @@ class Burley(AbstractProfile):
     singular: ClassVar[bool] = True
 
     @jit_unless_traced
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         shape = (*r.shape, *self.albedo.shape)
         radius = jnp.broadcast_to(r[..., None], shape)
         d = jnp.broadcast_to(self.length_scale(), shape)

@@ -56,7 +56,7 @@ class SingleScattering(AbstractProfile):
         return self.medium.channels
 
     @jit_unless_traced
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         shape = (*r.shape, self.channels)
         half_angle, weight = (
             jnp.expand_dims(angles, tuple(range(1, 1 + r.ndim))) for angles in self._escaping()
@@ -179,7 +179,7 @@ class PhotonBeam(AbstractHalfSpace):
     singular: ClassVar[bool] = True
 
     @jit_unless_traced
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         multiple = _MultipleScattering(self.medium, self.fresnel, self.strength)
         return multiple(r) + SingleScattering(self.medium, self.single)(r)
 
@@ -230,7 +230,7 @@ class _MultipleScattering(AbstractHalfSpace):
     strength: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0)
 
     @jit_unless_traced
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         shape = (_NODES, *r.shape, self.medium.channels)
         depth, weight = (along_first_axis(nodes, shape, self.medium.eta.dtype) for nodes in _beam())
         sigma_t_prime = jnp.broadcast_to(self.medium.sigma_t_prime, shape)

@@ -41,7 +41,7 @@ class Projected(AbstractProfile):
                 "give one row per channel"
             )
 
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return jnp.dot(self.profile(r), self.matrix)
 
     def total_reflectance(self) -> Float[Array, " channels"]:

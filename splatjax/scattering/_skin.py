@@ -314,7 +314,7 @@ class SkinProfile(AbstractProfile):
     has_separate_channels: ClassVar[bool] = True
 
     @jit_unless_traced
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         def scaled(medium: Medium, total: Float[Array, " channels"]):
             beam = PhotonBeam(medium)
             values = beam(r)

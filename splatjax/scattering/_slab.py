@@ -218,7 +218,7 @@ class AbstractSlabProfile(AbstractProfile):
         return 1 / self.top.medium.sigma_t_prime
 
     @jit_unless_traced
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return inverse_hankel_transform(
             lambda k: self.response(k).reflectance_above, r, self.decay_lengths()[0]
         )
@@ -247,7 +247,7 @@ class Transmitted(AbstractProfile):
 
     slab: AbstractSlabProfile
 
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return self.slab.transmittance(r)
 
     def total_reflectance(self) -> Float[Array, " channels"]:

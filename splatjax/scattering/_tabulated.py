@@ -61,7 +61,7 @@ class Tabulated(AbstractProfile):
         )
 
     @jit_unless_traced
-    def __call__(self, r: Float[Array, "*radii_"]) -> Float[Array, "*radii_ channels"]:
+    def evaluate(self, r: Float[Array, "*radii_"]) -> Float[Array, "*radii_ channels"]:
         flat = r.reshape(-1)
         columns = [jnp.interp(flat, self.radii, column, right=0.0) for column in self.values.T]
         return jnp.stack(columns, axis=-1).reshape(*r.shape, -1)

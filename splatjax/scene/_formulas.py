@@ -2,6 +2,7 @@
 a sky with the sun.
 """
 
+import dataclasses
 import math
 
 import equinox as eqx
@@ -73,6 +74,13 @@ class HarmonicLight(AbstractExtendedLight):
         directions, solid_angles = pixel_directions(len(radiance), radiance.dtype)
         harmonics = spherical_harmonics(directions @ environment.to_world().T, order)
         return cls(jnp.einsum("hwb,hwc,hw->bc", harmonics, radiance, solid_angles), **settings)
+
+    def with_channels(self, channels: int) -> "HarmonicLight":
+        harmonics, given = self.coefficients.shape
+        if given != 1:
+            return self
+        repeated = jnp.broadcast_to(self.coefficients, (harmonics, channels))
+        return dataclasses.replace(self, coefficients=repeated)
 
     def radiance(self, directions: Float[Array, "*points 3"]) -> Float[Array, "*points channels"]:
         """Compute the radiance from world directions, which are unit vectors."""

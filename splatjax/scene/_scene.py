@@ -261,8 +261,8 @@ class Scene(eqx.Module):
     **Attributes:** (differentiable)
 
     - `splats`: the surface of the body.
-    - `lights`: one light or several. A light of one channel, except a `HarmonicLight`, applies to
-      every channel of the material. Lights of one kind are computed together.
+    - `lights`: one light or several. A light of one channel applies to every channel of
+      the material. Lights of one kind are computed together.
     - `material`: the material of all splats. For splats with an albedo, use `material.white()`, so
       that the albedo alone determines the color.
     """

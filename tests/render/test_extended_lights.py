@@ -376,6 +376,16 @@ def test_irradiance_on_a_ball_is_that_of_its_bands(count):
     assert np.max(np.abs(irradiance(scene).T - exact)) < HARMONIC[count]
 
 
+@pytest.mark.once
+def test_a_harmonic_light_of_one_channel_is_gray():
+    light = HarmonicLight([[1.0], [0.3], [-0.2], [0.1]], count=64, cast_shadows=False)
+    gaussians = sj.SumOfGaussians([1.0], np.ones((1, 3)))
+    scene = sj.Scene(sphere(300), light, sj.Material(gaussians, eta=1.0, specular=0.0))
+    found = irradiance(scene)
+    np.testing.assert_array_equal(found, np.broadcast_to(found[:1], found.shape))
+    np.testing.assert_allclose(np.mean(found), np.pi / np.sqrt(4 * np.pi), rtol=0.01)
+
+
 def test_an_environment_of_one_harmonic_has_its_coefficient():
     """Turned by 90 degrees about y, the harmonics of z and x are those of x and -z."""
     eye = np.eye(4)[:, [0, 2, 3]]

@@ -76,11 +76,13 @@ def test_channels_at_their_own_radii_are_those_at_all_radii(float64, name):
 
 
 @models
-def test_radii_may_be_integers(float64, name):
+def test_radii_may_be_any_numbers(float64, name):
     profile = MODELS[name](medium(), 1.0)
-    with jax.numpy_dtype_promotion("standard"):
-        found = profile(jnp.arange(1, 4))
-    np.testing.assert_allclose(found, profile(jnp.arange(1.0, 4.0)), rtol=1e-13)
+    expected = profile(jnp.arange(1.0, 4.0))
+    for radii in (jnp.arange(1, 4), [1, 2, 3], (1.0, 2.0, 3.0), np.arange(1, 4)):
+        np.testing.assert_allclose(profile(radii), expected, rtol=1e-13)
+    for radius in (2, 2.0, np.float32(2)):
+        np.testing.assert_allclose(profile(radius), expected[1], rtol=1e-6)
 
 
 @models
