@@ -237,8 +237,9 @@ def models(eta: float) -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
     """Return what is compared: material and settings, by name."""
     albedo = jnp.asarray(ALBEDO)
     medium = sj.Medium(SIGMA_T * (1 - albedo), SIGMA_T * albedo, eta)
-    model, single = sj.fitting.TransportModel(), sj.SingleScattering(medium)
+    model = sj.fitting.TransportModel()
     half_space, beam = model.half_space(medium), model.profile(medium)
+    single = beam.single_scattered()
     apart = single.directional_albedo(jnp.asarray(half_space.cosines()))
     flat = fitted(beam, eta)
     whole, solved = (

@@ -123,13 +123,14 @@ def _without_single(target: Reference, medium: sj.Medium, g: float) -> Reference
     """Separate the light that is scattered once from a profile, and compute the angles of the
     rest.
     """
-    single, half_space = sj.SingleScattering(medium), sj.scattering.HalfSpace(medium, g)
-    scattered_once = single.directional_albedo(jnp.asarray(half_space.cosines()))
+    model = sj.fitting.TransportModel(g)
     whole: Any = target.profile
-    is_exact = isinstance(whole, sj.scattering.PhotonBeam)
+    beam = whole if isinstance(whole, sj.scattering.PhotonBeam) else model.profile(medium)
+    single, half_space = beam.single_scattered(), model.half_space(medium)
+    scattered_once = single.directional_albedo(jnp.asarray(half_space.cosines()))
     return replace(
         target,
-        profile=whole.multiply_scattered() if is_exact else whole.without(single),
+        profile=beam.multiply_scattered() if beam is whole else whole.without(single),
         single=single,
         description=f"{target.description}, without single scattering",
         angles=half_space.angular_law(scattered_once),

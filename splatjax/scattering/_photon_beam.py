@@ -10,7 +10,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, numbers, record
+from splatjax._records import numbers, record
 from splatjax.gaussians import AbstractProfile
 
 from ._dipole import AbstractHalfSpace, BetterDipole
@@ -40,7 +40,8 @@ class SingleScattering(AbstractProfile):
     **Attributes:**
 
     - `medium`: its coefficients, [channels].
-    - `strength`: a factor, [channels]; 1 except for materials made white.
+    - `strength`: a factor, [channels]; 1 except for materials made white, and media that do not
+      scatter isotropically (`PhotonBeam.single_scattered`).
 
     **Source:** Habel, Christensen and Jarosz 2013 (profile); Hanrahan and Krueger 1993 (radiance).
     """
@@ -180,8 +181,7 @@ class PhotonBeam(AbstractHalfSpace):
 
     @jit_unless_traced
     def evaluate(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        multiple = _MultipleScattering(self.medium, self.fresnel, self.strength)
-        return multiple(r) + SingleScattering(self.medium, self.single)(r)
+        return self.multiply_scattered()(r) + self.single_scattered()(r)
 
     @jit_unless_traced
     def with_total(self, total: Float[Array, " channels"]) -> "PhotonBeam":
@@ -190,7 +190,7 @@ class PhotonBeam(AbstractHalfSpace):
         1 to 9%. Where less than half of multiple scattering's part of `total` would be left to it,
         it keeps this half, and single scattering is scaled, too.
         """
-        single = SingleScattering(self.medium, self.single).total_reflectance()
+        single = self.single_scattered().total_reflectance()
         multiple = _MultipleScattering(self.medium, self.fresnel).total_reflectance()
         total = jnp.asarray(total)
         strength = (total - single) / multiple
@@ -203,26 +203,18 @@ class PhotonBeam(AbstractHalfSpace):
         """Compute `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple
         scattering by quadrature.
         """
-        multiple = _MultipleScattering(self.medium, self.fresnel, self.strength)
-        single = SingleScattering(self.medium, self.single)
+        multiple, single = self.multiply_scattered(), self.single_scattered()
         return multiple.total_reflectance() + single.total_reflectance()
 
     def multiply_scattered(self) -> AbstractProfile:
-        """Return multiple scattering, which is finite at `r = 0`, for a material with a separate
-        `SingleScattering(medium)`. Together they have the total of this profile.
-
-        **Raises:** `ValueError` where single scattering exceeds the total.
+        """Return multiple scattering, which is finite at `r = 0`, for a material with separate
+        `single_scattered()`. Their sum is this profile.
         """
-        multiple = _MultipleScattering(self.medium, self.fresnel).total_reflectance()
-        single = SingleScattering(self.medium).total_reflectance()
-        strength = self.strength - (1 - self.single) * single / multiple
-        check_values(
-            "the strength of multiple scattering",
-            strength,
-            "positive: single scattering exceeds the total; do not separate it, or lower g",
-            lambda x: x > 0,
-        )
-        return _MultipleScattering(self.medium, self.fresnel, strength)
+        return _MultipleScattering(self.medium, self.fresnel, self.strength)
+
+    def single_scattered(self) -> SingleScattering:
+        """Return single scattering, for `Material.single_scattering`."""
+        return SingleScattering(self.medium, self.single)
 
 
 @record

@@ -335,6 +335,7 @@ def test_a_table_and_a_photon_beam_are_it_and_the_rest():
     r, ours = jnp.asarray([0.1, 0.5, 2.0]), single(0.97, 1.3, channels=2)
     table = sj.scattering.Tabulated(r, 2 * ours(r), total=2 * ours.total_reflectance())
     beam = sj.scattering.PhotonBeam(ours.medium)
+    assert jax.tree.all(jax.tree.map(np.array_equal, beam.single_scattered(), ours))
     for whole, rest in ((table, table.without(ours)), (beam, beam.multiply_scattered())):
         np.testing.assert_allclose(rest(r) + ours(r), whole(r), rtol=1e-5)
         total = rest.total_reflectance() + ours.total_reflectance()
