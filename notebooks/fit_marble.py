@@ -48,7 +48,7 @@ figure  # noqa: B018
 
 # %% [markdown]
 # The error $E$ (Eq. 4 of the paper) depends little on the tail, so the unconstrained fit misses a
-# few per cent of the red energy there. Fixing the sum of the weights to the total reflectance
+# few percent of the red energy there. Fixing the sum of the weights to the total reflectance
 # conserves the energy, at a slightly larger error. The materials of the library are fitted in this
 # way.
 

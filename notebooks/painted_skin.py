@@ -23,7 +23,7 @@
 # every splat by gradients of the renderer. The two fits are separate, because least squares finds
 # six coefficients in a few cheap steps by using their correlations, whereas a first-order method
 # would need many steps together with thousands of albedos. Paint near the border absorbs light from
-# bare skin, which changes the coefficients by a per cent. To remove this error, alternate the two
+# bare skin, which changes the coefficients by a percent. To remove this error, alternate the two
 # fits, starting from the fitted paint.
 
 # %%

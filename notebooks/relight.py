@@ -115,7 +115,7 @@ figure  # noqa: B018
 # %% [markdown]
 # For the soft studio, the true values are within the error bars. The full studio contains light
 # that a sum of 25 harmonics cannot represent. Its residual exceeds the noise, which indicates that
-# the error bars are too small, but the nine coefficients are still accurate to some per cent.
+# the error bars are too small, but the nine coefficients are still accurate to a few percent.
 
 # %%
 assert np.max(np.abs(found["soft"][0] - true) / found["soft"][1]) < 4

@@ -83,10 +83,10 @@ figure  # noqa: B018
 # - **Dipole** (Jensen 2001): the model of most published fits and coefficients. It has too much
 #   light between one and two mean free paths, and too little in the tail for strong absorption. Use
 #   it to compare with the literature.
-# - **BetterDipole** (d'Eon 2012): the same cost, the best totals, and errors of about ten per cent
+# - **BetterDipole** (d'Eon 2012): the same cost, the best totals, and errors of about ten percent
 #   beyond one mean free path for weak absorption.
 # - **PhotonBeam** (Habel 2013): includes single scattering, which diverges like $1/r$ at the
-#   origin. Beyond one mean free path its error for marble is a few per cent. If in doubt, use it
+#   origin. Beyond one mean free path its error for marble is a few percent. If in doubt, use it
 #   with a cut.
 # - **Burley** (Christensen 2015): a curve fitted to Monte Carlo, with a color and a length as
 #   parameters, as in many film renderers. It does not include the index of refraction, so for

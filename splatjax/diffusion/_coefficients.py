@@ -51,7 +51,7 @@ class DiffusionCoefficients(eqx.Module):
         inward = 4 / (1 - fresnel.first_moment(medium.eta))
         z_e = _MILNE / 4 * (1 + fresnel.second_moment(medium.eta)) * inward
         z_e = z_e / (sigma_t * jnp.maximum(albedo, _LEAST_ALBEDO))
-        # An absorbing half space then reflects even light as Chandrasekhar's H function does.
+        # An absorbing half space then reflects uniform light as Chandrasekhar's H function does.
         inward = inward * (1 + 4.5 * loss) / (1 + 4.95 * loss)
         excess, squared_kappa = 0.53 + 0.265 * loss, medium.sigma_a / diffusion
         lasting = 1 - loss * excess

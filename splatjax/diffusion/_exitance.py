@@ -24,7 +24,7 @@ class ExitanceDiffuser(AbstractDiffuser):
     takes three quarters of the time, and each further frame of an orbit half.
 
     Each splat has one gain of the kernel, also along its slopes. The picture hardly differs inside;
-    along outlines it differs by a few per cent where pixels are wider than splats. `Frame.layers`
+    along outlines it differs by a few percent where pixels are wider than splats. `Frame.layers`
     has the sum alone, with a weight of 1, and `Frame.unresolved_fraction` is 0. Derivatives by
     Gaussians (`diffusion_basis`, `picture_jacobian`) need separate layers.
 

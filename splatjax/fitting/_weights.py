@@ -145,7 +145,7 @@ class AbstractWeights(eqx.Module):
 
 class FreeWeights(AbstractWeights):
     """Unconstrained weights, which minimize the error (Eq. 3). Their sum may differ from the
-    profile's total reflectance by a few per cent.
+    profile's total reflectance by a few percent.
     """
 
     def solve(self, basis, target, energies, total):

@@ -296,7 +296,7 @@ class LayeredMultipole(AbstractSlabProfile):
     Each layer is a multipole; the layers are combined by adding, in the Hankel domain. The
     interface between two scattering layers has the ratio of their indices; a film has no interface.
     Light enters from above as a narrow beam. Each slab has its own extrapolated boundaries, so
-    dividing a slab into two layers of the same medium changes the result, by a few per cent for a
+    dividing a slab into two layers of the same medium changes the result, by a few percent for a
     slab four mean free paths thick.
 
     Differentiable in every coefficient and thickness, and in `r`.
