@@ -46,6 +46,11 @@ def several(values: Item | Sequence[Item]) -> Any:
     return values
 
 
+def plain_int(value: Any) -> Any:
+    """Convert NumPy's integers, for static fields."""
+    return int(value) if isinstance(value, np.integer) else value
+
+
 def valid(
     requirement: str, holds: Callable[[np.ndarray], Any] = lambda x: x == x, finite: bool = True
 ) -> dict[str, Any]:

@@ -117,6 +117,7 @@ def keep(
         raise PermissionError(f"{kept_folder}: other users may write to this folder; delete it")
     _source()  # read now, since files may change while the program runs
     _folder, _compiler_options = kept_folder, dict(compiler_options)
+    _remember(_read(_capacities_path()) or {})
     return cache_folder
 
 
@@ -124,8 +125,9 @@ def reuse_capacity(kind: Hashable, least: int, capacity: int, most: float = 1.25
     """Return a capacity for arrays of a kind, preferably one for which programs are already
     compiled.
 
-    Among the capacities that this process planned before, it is the smallest from `least` up to
-    `most` times `capacity`. If there is none, `capacity` is remembered and returned.
+    Among the capacities that were planned before, by this process or by earlier ones with the same
+    cache, it is the smallest from `least` up to `most` times `capacity`. If there is none,
+    `capacity` is remembered and returned.
 
     With several processes nothing is remembered, because all must run the same programs.
     """
@@ -138,6 +140,16 @@ def reuse_capacity(kind: Hashable, least: int, capacity: int, most: float = 1.25
     return min(serving, default=capacity)
 
 
+def _remember(capacities: dict[Hashable, list[int]]) -> None:
+    for kind, sizes in capacities.items():
+        _capacities[kind] = sorted({*_capacities.get(kind, ()), *sizes})
+
+
+def _capacities_path() -> Path:
+    assert _folder is not None
+    return _folder / f"capacities-{_digest(_source(), *_versions()).hex()}"
+
+
 def kept(function: Function) -> Function:
     """Cache the results of a function of arrays and numbers, by the values of its arguments."""
 
@@ -148,7 +160,11 @@ def kept(function: Function) -> Function:
             return function(*arguments, **named)
         result = _read(path)
         if result is None:
+            known = sum(map(len, _capacities.values()))
             result = _write(path, jax.device_get(function(*arguments, **named)))
+            if sum(map(len, _capacities.values())) > known:
+                _remember(_read(_capacities_path()) or {})  # of other processes
+                _write(_capacities_path(), _capacities)
         return jax.device_put(result)  # compiles nothing, unlike jnp.asarray
 
     return cast("Function", called)
@@ -239,7 +255,7 @@ def _path(function: Any, arguments: Any, *, by_values: bool) -> Path | None:
         sorted(item for item in jax.config.values.items() if not _EFFECTLESS.search(item[0])),
         (os.environ.get("XLA_FLAGS"), by_values or sorted(_compiler_options.items())),
         (platform.python_version(), _processor(), _source()),
-        [module.__version__ for module in (jax, jaxlib, eqx)],
+        _versions(),
     )
     return _folder / f"{function.__name__}-{_digest(repr(depends_on).encode()).hex()}".strip("_")
 
@@ -268,6 +284,10 @@ def _source() -> bytes:
     """Compute a digest of the modules of splatjax and of the data that they read."""
     files = *Path(__file__).parent.rglob("*.py"), *profiles_folder().glob("*.npz")
     return _digest(*(path.read_bytes() for path in sorted(files)))
+
+
+def _versions() -> list[bytes]:
+    return [module.__version__.encode() for module in (jax, jaxlib, eqx)]
 
 
 def _digest(*contents: bytes) -> bytes:

@@ -9,7 +9,7 @@ import sys
 import jax
 import jax.numpy as jnp
 
-from splatjax.cache import keep, kept, kept_jit
+from splatjax.cache import keep, kept, kept_jit, reuse_capacity
 
 made = []
 
@@ -18,6 +18,11 @@ made = []
 def squares(values, power=2):
     made.append("squares")
     return {"squares": jnp.asarray(values) ** power}
+
+
+@kept
+def planned(least):
+    return {"size": jnp.asarray(reuse_capacity("things", int(least), int(least)))}
 
 
 @kept_jit

@@ -15,7 +15,7 @@ import jaxlib
 import numpy as np
 import pytest
 from bodies import PLAIN, two_gaussians
-from kept_programs import made, squares, total
+from kept_programs import made, planned, squares, total
 from processes import run_together
 
 import splatjax as sj
@@ -52,7 +52,7 @@ def test_a_second_start_makes_the_same_picture_and_compiles_nothing(folder, comp
     assert compiled == []
     assert eqx.tree_equal(*frames)
     names = sorted(path.name.partition("-")[0] for path in folder.iterdir())
-    assert names == ["bust", "make_plan", "render"]
+    assert names == ["bust", "capacities", "make_plan", "render"]
 
 
 DAMAGED = {
@@ -176,6 +176,15 @@ def test_nothing_is_kept_of_code_of_the_user_or_while_jax_traces(folder, monkeyp
     assert list(folder.iterdir()) == []
     total(OfTheUser(ones, "a word"))
     assert len(list(folder.iterdir())) == 1
+
+
+def test_capacities_of_earlier_starts_are_reused(tmp_path):
+    sizes = [int(planned(jnp.asarray(least))["size"]) for least in (100, 90)]
+    sj.cache._capacities.clear()  # a start without the folder
+    sizes.append(int(planned(jnp.asarray(80))["size"]))
+    sj.cache._capacities.clear()
+    sj.cache.keep(tmp_path)
+    assert [*sizes, int(planned(jnp.asarray(95))["size"])] == [100, 100, 80, 100]
 
 
 def test_what_was_not_used_for_longest_is_deleted(folder, monkeypatch):

@@ -8,11 +8,13 @@ import ctypes
 import functools
 import operator
 import os
+import signal
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import equinox as eqx
 import jax
@@ -43,6 +45,7 @@ Lengths are in mm.
 `splatjax COMMAND --help` explains a command. --debug adds the traceback to an error.
 `splatjax --version` prints the version."""
 _DEBUG = "--debug"
+_PATIENCE = 3.0  # s, until a program that does not notice an interruption is ended
 # Options of XLA, with which a picture compiles in three quarters of the time and renders a tenth
 # slower.
 _OF_ONE_PICTURE = {"xla_cpu_use_fusion_emitters": False}
@@ -87,6 +90,34 @@ def main(args: Sequence[str] | None = None) -> int:
         message, status = _message(error)
     print(f"splatjax: {message}", file=sys.stderr)
     return status
+
+
+def run_and_exit() -> NoReturn:
+    """Run the command of the command line, and end the process. XLA does not notice interruptions
+    while it compiles, so a thread ends the process if Python does not react.
+    """
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer)
+    noticed = threading.Event()
+
+    def interrupt(*_: object) -> None:
+        noticed.set()
+        raise KeyboardInterrupt
+
+    def end_unless_noticed() -> None:
+        os.read(reader, 1)
+        if not noticed.wait(_PATIENCE):
+            print("splatjax: interrupted", file=sys.stderr, flush=True)
+            os._exit(130)
+
+    signal.signal(signal.SIGINT, interrupt)
+    threading.Thread(target=end_unless_noticed, daemon=True).start()
+    status = main()
+    if status == 130:
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
 
 
 def parsed(words: list[str]) -> Any:

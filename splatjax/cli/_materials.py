@@ -35,6 +35,7 @@ _SCENES = {
     ".usdc": sj.io.save_usd,
 }
 _OPEN = 0.02  # least mean normal of an open surface; a closed surface has 0
+_SMALLEST, _LARGEST = 1.0, 1e4  # mm, of usual bodies
 _ACROSS = 8  # pictures in a row of a sheet
 
 
@@ -285,4 +286,6 @@ class Sample:
             f"{', '.join(carried) or 'no maps'}; the body is {size[0]:.3g} mm wide, {size[1]:.3g} "
             f"high and {size[2]:.3g} deep"
         )
+        if not _SMALLEST < np.max(size) < _LARGEST:
+            note("this is an unusual size; check --mm-per-unit")
         print(self.output)

@@ -87,7 +87,7 @@ class PictureOptions(ViewOptions):
             wavelengths=material.wavelengths,
         )
         if widths:
-            note_unresolved(frame, scene, settings.kernel, count or scene.splats.count)
+            note_unresolved(frame, scene, settings.kernel, self.count_option, count)
         if self.background == "environment":
             environment = next(light for light in lights if isinstance(light, sj.EnvironmentLight))
             shown = environment.behind(frame, camera)

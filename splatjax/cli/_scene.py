@@ -94,10 +94,12 @@ def draw(
     return frame
 
 
-def note_unresolved(frame: sj.Frame, scene: sj.Scene, kernel: Any, count: int) -> None:
+def note_unresolved(
+    frame: sj.Frame, scene: sj.Scene, kernel: Any, option: str, count: int | None
+) -> None:
     """Print a note about layers that the splats do not resolve, and the number of splats that would
-    resolve the widest of them. The splats of the scene may be a part of the `count` splats of the
-    frame.
+    resolve the widest of them, which `option` sets. The splats of the scene may be a part of the
+    `count` splats of the frame, if given.
     """
     unresolved = np.asarray(frame.unresolved_fraction) > 0.5
     variances = np.asarray(scene.material.gaussians.variances)
@@ -106,11 +108,12 @@ def note_unresolved(frame: sj.Frame, scene: sj.Scene, kernel: Any, count: int) -
     deviations = np.sqrt(variances)[unresolved]
     interval = np.asarray(kernel.interval(sj.diffusion.unevenness(scene.splats)))
     # Half of a layer is resolved if its variance is in the middle of the interval.
+    count = count or scene.splats.count
     needed = count * np.mean(scene.splats.areas) * np.mean(interval**2) / deviations[-1] ** 2
     widths = ", ".join(f"{width:.3g}" for width in deviations)
     _note_once(
         "unresolved, because they are narrower than the splats: Gaussians of standard deviations "
-        f"{widths} mm; about {float(f'{needed:.2g}'):,.0f} splats of this body (--count) resolve "
+        f"{widths} mm; about {float(f'{needed:.2g}'):,.0f} splats of this body ({option}) resolve "
         f"that of {deviations[-1]:.3g} mm"
     )
 

@@ -155,6 +155,7 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
 
 
 # Environment variables of launchers with the number of processes; the first that is set is used.
+_LONGEST = 80  # characters of a setting that an error repeats
 _COUNTS = "JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"
 
 
@@ -224,6 +225,8 @@ def _check_record(path: Path, record: Mapping[str, Any], items: Sequence[tuple[P
     before = sj.io.read_record(path) if path.exists() else record
     changes = [
         f"{name} is {record.get(name)}, but was {before.get(name)}"
+        if len(str(record.get(name))) < _LONGEST
+        else f"{name} changed"
         for name in sorted(before.keys() | record.keys())
         if before.get(name) != record.get(name)
     ]

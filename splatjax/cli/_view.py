@@ -41,7 +41,8 @@ _BESIDE_SCENES = {
 class ViewOptions:
     """Splats of one material, a camera that shows all of them, and lights."""
 
-    #: PLY file of splats, in mm (`splatjax sample` writes one). Default: the built-in bust.
+    #: PLY or SPZ file of splats, in mm (`splatjax sample` writes one), scene in a TOML file, or EXR
+    #: file of a picture. Default: the built-in bust.
     splats: Annotated[
         tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[SPLATS]", help_behavior_hint="")
     ] = None
@@ -169,6 +170,12 @@ class ViewOptions:
         """Return the name of the environment, by default the studio; `None` for single lights."""
         is_lit = any(getattr(self, name) is not None for name in _SINGLE_LIGHT)
         return self.environment or (None if is_lit else "studio")
+
+    @property
+    def count_option(self) -> str:
+        """Return what sets the number of splats."""
+        of_file = "`count` of the scene" if self.table else "splatjax sample --count"
+        return of_file if self.splats else "--count"
 
     @functools.cached_property
     def _environment(self) -> sj.EnvironmentLight | None:

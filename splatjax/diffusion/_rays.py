@@ -173,9 +173,9 @@ class SolvedLight(eqx.Module):
             balance = coefficients.diffusion_coefficient / coefficients.z_e * coefficients.inward
             fluence, flux = fluence + (balance - 1)[:, None] * bounced, flux - bounced
         entering = jnp.maximum(-jnp.sum(directions * normals[None], axis=1), 0)
-        light = SurfaceLight(
-            fluence, flux, beams.irradiance, entering, direction=jnp.mean(directions, axis=0)
-        )
+        lit = jnp.sum(jnp.any(directions != 0, axis=1), axis=0).astype(directions.dtype)
+        direction = jnp.sum(directions, axis=0) / jnp.maximum(lit, 1)[None]  # of the lit channels
+        light = SurfaceLight(fluence, flux, beams.irradiance, entering, direction)
         far, _, thickness = at_exits(light, surface, -normals, surface.areas > 0)
 
         def towards(cosine):

@@ -52,6 +52,8 @@ def lookup_at(
     """
     if picture is None:
         return None
+    if picture.shape[:2] == (1, 1):
+        return np.broadcast_to(picture[0, 0], (len(points.faces), *picture.shape[2:]))
     if mesh.uvs is None:
         raise ValueError(
             "the mesh has no texture coordinates, which textures need; give a mesh with UVs, "
@@ -78,10 +80,7 @@ def albedo_at(
         albedo = np.empty((len(points.faces), 3))
         for part, picture in enumerate(textures.albedo):
             chosen = np.flatnonzero(mesh.parts[points.faces] == part)
-            is_plain = picture.shape[:2] == (1, 1)
-            albedo[chosen] = (
-                picture[0, 0] if is_plain else lookup_at(mesh, points.take(chosen), picture)
-            )
+            albedo[chosen] = lookup_at(mesh, points.take(chosen), picture)
     else:
         albedo = lookup_at(mesh, points, textures.albedo)
     if mesh.colors is None:

@@ -106,6 +106,8 @@ def one_sentence(path: Path) -> Generator[None, None, None]:
     except Exception as error:  # readers raise exceptions of any kind
         if isinstance(error, (ValueError, OSError)) and str(error).startswith(str(path)):
             raise
+        if isinstance(error, ValueError) and "; " in str(error):  # with its remedy
+            raise ValueError(f"{path}: {error}") from None
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__} "
         raise ValueError(
             f"{path}: cannot be read ({kind}{' '.join(str(error).split())[:200]}); it is "

@@ -12,7 +12,6 @@ from ._basis import (
     relighting_basis as relighting_basis,
     RelightingBasis as RelightingBasis,
 )
-from ._devices import map_over as map_over
 from ._checks import (
     BYTES_PER_PIXEL as BYTES_PER_PIXEL,
     BYTES_PER_SPLAT as BYTES_PER_SPLAT,
@@ -25,17 +24,21 @@ from ._lighting import (
     irradiance_at_splats as irradiance_at_splats,
     LightVisibility as LightVisibility,
     shadow_views as shadow_views,
-    surface_parameters as surface_parameters,
     Transfer as Transfer,
 )
 from ._passes import SplatLight as SplatLight
+from ._map_over import map_over as map_over
 from ._plan import make_plan as make_plan, Plan as Plan
 from ._settings import (
     AbstractLighting as AbstractLighting,
     LightAtSplats as LightAtSplats,
     RenderSettings as RenderSettings,
 )
-from ._surface import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples
+from ._surface import (
+    surface_parameters as surface_parameters,
+    SurfaceAttributes as SurfaceAttributes,
+    SurfaceSamples as SurfaceSamples,
+)
 from ._render import (
     compute_irradiance as compute_irradiance,
     diffuse_irradiance as diffuse_irradiance,

@@ -17,12 +17,13 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, HarmonicLight, Scene
 from splatjax.splatting import PerspectiveView, invalid_factor
 
+from ._checks import check_shape
 from ._devices import cut_to, on_devices, pad_scene
 from ._lighting import Transfer
 from ._passes import SplatLight
-from ._plan import Plan, plan_unless_traced
+from ._plan import Plan, check_linear_in_weights, plan_unless_traced
 from ._render import render, transfer
-from ._settings import RenderSettings, check_linear_in_weights
+from ._settings import RenderSettings
 from ._surface import ShadedSurface, in_a_row
 
 
@@ -59,7 +60,12 @@ class DiffusionBasis(eqx.Module):
 
         - `gaussians`: the variances are assumed to be those that were rendered; with the derivative
           they may differ a little, to first order.
+
+        **Raises:** `ValueError` for another number of Gaussians or channels.
         """
+        shape = len(self.light.variances), self.specular.shape[2]
+        remedy = "give as many Gaussians and channels as the basis was rendered with"
+        check_shape("gaussians.weights", gaussians.weights, shape, remedy)
         radiance = self.pixel_radiance_per_exitance * self.light.exitance(gaussians)
         height, width, channels = self.specular.shape
         diffuse = jnp.zeros((channels, height * width), radiance.dtype)
@@ -108,8 +114,10 @@ def diffusion_basis(
             "scene.material has single scattering, with which the light that enters depends "
             "on the weights; render each material separately, or give single_scattering=None"
         )
-    check_linear_in_weights(settings)
     plan = plan_unless_traced(scene, camera, settings, plan)
+    check_linear_in_weights(settings, plan)
+    if derivative and isinstance(light, SplatLight) and light.derivative is None:
+        raise ValueError("light has no derivative; compute it by illuminate(..., derivative=True)")
     scene, plan, light, own_rows = pad_scene(scene, plan, light, camera)
     basis = _diffusion_basis(scene, camera, settings, plan, derivative, light)
     names = "variances", "means", "mass", "derivative", "factors"
@@ -184,8 +192,9 @@ class RelightingBasis(eqx.Module):
     @full_precision
     @eqx.filter_jit
     def beauty(self, light: HarmonicLight) -> Float[Array, "height width channels"]:
-        """Compute the picture that `render` makes under a light: a sum over its harmonics.
-        Differentiable in every mode.
+        """Compute the picture that `render` makes under a light whose radiance is positive: a sum
+        over its harmonics. Where light is negative, `render` limits it to 0, and this picture does
+        not. Differentiable in every mode.
 
         **Arguments:**
 

@@ -3,6 +3,7 @@
 import functools
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -56,6 +57,12 @@ def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
     )
     for message in _warnings(scene, camera, is_lit):
         _warn_once(message)
+
+
+def check_shape(name: str, array: Any, shape: tuple[int, ...], remedy: str) -> None:
+    """Raise `ValueError` for an array of another shape."""
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {list(array.shape)}, not {list(shape)}; {remedy}")
 
 
 def check_planned(scenes: list[Scene], cameras: list[Camera]) -> None:

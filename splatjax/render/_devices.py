@@ -3,26 +3,36 @@ scenes so that many share a compiled program.
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from splatjax._chunking import Result
 from splatjax._combination import DeviceMesh, lay_out
-from splatjax._records import is_traced
+from splatjax._records import check_class, is_traced
 from splatjax.gaussians import pad_gaussians
-from splatjax.scene import AbstractLightSample, Camera, Frame, Scene, Splats, lights_by_kind
+from splatjax.scene import (
+    AbstractLight,
+    AbstractLightSample,
+    Camera,
+    Frame,
+    Scene,
+    Splats,
+    lights_by_kind,
+)
 
 from ._checks import in_one_dtype
 from ._lighting import Transfer
+from ._parts import arrange, pad_splats, splats_per_device
 from ._passes import Passes, SplatLight
-from ._plan import Plan, arrange, pad_splats, splats_per_device
+from ._plan import Plan
 from ._settings import RenderSettings
 
 Record = TypeVar("Record", bound=eqx.Module)
@@ -93,7 +103,7 @@ def pad_scene(
     **Raises:** `ValueError` for a precomputed result of other lights or another number of splats.
     """
     if light is not None:
-        _check_kept(light, scene, plan)
+        light = _checked(light, scene, plan)
     material = plan.diffusion.material(scene.material)
     scene = Scene(scene.splats, scene.lights, material)
     layers = len(plan.diffusion.shown(scene).material.gaussians.variances)
@@ -159,8 +169,26 @@ def resize_visibility(light: Kept, scene: Scene) -> Kept:
     return dataclasses.replace(light, visibility=visibility)
 
 
-def _check_kept(light: SplatLight | Transfer, scene: Scene, plan: Plan) -> None:
-    """Raise `ValueError` for a precomputed result of other lights or another number of splats."""
+_PLACES = "direction", "directions", "position", "center"
+
+
+def places_of(lights: Sequence[AbstractLight]) -> tuple[dict[str, Array], ...]:
+    """Return the directions and positions of lights, which determine their shadow maps."""
+    fields = [{name: getattr(light, name, None) for name in _PLACES} for light in lights]
+    return tuple({k: v for k, v in places.items() if v is not None} for places in fields)
+
+
+def _are_close(*trees: PyTree) -> bool:
+    leaves, structures = zip(*map(jax.tree.flatten, trees), strict=True)
+    return structures[0] == structures[1] and all(map(partial(np.allclose, atol=1e-5), *leaves))
+
+
+def _checked(light: Kept, scene: Scene, plan: Plan) -> Kept:
+    """Return a precomputed result without the places of its lights.
+
+    **Raises:** `ValueError` for other lights or another number of splats.
+    """
+    check_class("light", light, SplatLight, Transfer)
     groups = jax.eval_shape(
         lambda lights: [[sample for _, sample in group] for group in lights_by_kind(lights)],
         scene.lights,
@@ -172,6 +200,15 @@ def _check_kept(light: SplatLight | Transfer, scene: Scene, plan: Plan) -> None:
             f"light has visibility {kept} (samples of each kind of lights, splats), and the "
             f"scene with its plan has {shapes}; compute it again with lights of these kinds"
         )
+    if not isinstance(light, Transfer):
+        return light
+    pair = light.places, places_of(scene.lights)
+    if light.places and not is_traced(pair) and not _are_close(*pair):
+        raise ValueError(
+            "light was computed for lights in other directions or at other positions; compute it "
+            "again, or give an EnvironmentLight fixed `directions`"
+        )
+    return dataclasses.replace(light, places=())
 
 
 def on_devices(
@@ -244,61 +281,3 @@ def along_splats(tree: PyTree, devices: DeviceMesh) -> PyTree:
         ),
         tree,
     )
-
-
-def map_over(
-    mesh: Mesh, function: Callable[[Any, Any], PyTree], shared: PyTree, batch: PyTree
-) -> PyTree:
-    r"""Apply a function to every element of a batch, with the elements divided among the devices of
-    a mesh. Each device computes its elements one after the other, like `jax.lax.map`.
-
-        mesh = jax.make_mesh((jax.device_count(),), ("views",))
-        batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
-        frames = map_over(mesh, lambda s, camera: render(s, camera, plan=plan), scene, batch)
-
-    **Arguments:**
-
-    - `mesh`: a mesh of any axes; all its devices are used.
-    - `function`: a pure function of `shared` and one element; the same function is compiled once.
-    - `shared`: replicated on every device. Differentiable.
-    - `batch`: a tree of arrays with the elements along the first axis, any number; static parts are
-      shared. Differentiable.
-
-    **Returns:** the results, stacked along a new first axis. If the number of devices divides the
-    number of elements, this axis stays divided among the devices; otherwise every device has all
-    results.
-
-    **Raises:** `ValueError` if the batch is empty, or its arrays have different lengths.
-    """
-    arrays = jax.tree_util.tree_leaves_with_path(eqx.filter(batch, eqx.is_array))
-    shapes = {jax.tree_util.keystr(path): list(leaf.shape) for path, leaf in arrays}
-    lengths = {tuple(shape[:1]) for shape in shapes.values()}
-    if len(lengths) != 1 or lengths & {(), (0,)}:
-        raise ValueError(
-            "the arrays of a batch must have one length along their first axis, not zero; these "
-            f"have the shapes {shapes}; stack them, or share those that have no such axis"
-        )
-    return _map_over(mesh, function, shared, batch)
-
-
-@eqx.filter_jit
-def _map_over(mesh: Mesh, function: Callable, shared: PyTree, batch: PyTree) -> PyTree:
-    devices = DeviceMesh.of(mesh)
-    count = len(jax.tree.leaves(eqx.filter(batch, eqx.is_array))[0])
-    places = np.arange(count + -count % devices.count)
-    arrays, static = eqx.partition((shared, batch), eqx.is_array)
-    arrays = arrays[0], jax.tree.map(lambda leaf: rows_or_last(leaf, places), arrays[1])
-
-    def share(shared, batch):
-        replicated = eqx.combine(shared, static[0])
-        return jax.lax.map(lambda item: function(replicated, eqx.combine(item, static[1])), batch)
-
-    specs = PartitionSpec(), devices.shares
-    mapped = jax.shard_map(
-        share, mesh=mesh, in_specs=specs, out_specs=devices.shares, check_vma=False
-    )
-    results = mapped(*lay_out(mesh, arrays, specs))
-    if len(places) == count:
-        return results
-    replicated = lay_out(mesh, results, PartitionSpec())
-    return jax.tree.map(lambda leaf: leaf[:count], replicated)

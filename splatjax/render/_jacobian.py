@@ -9,15 +9,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from splatjax._records import Numbers, as_floats
 from splatjax.cache import kept_jit
 from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
 from splatjax.splatting import PerspectiveView
 
+from ._checks import check_shape
 from ._devices import cut_frame, cut_to, on_devices, pad_scene
-from ._plan import Plan, plan_unless_traced
-from ._settings import LightAtSplats, RenderSettings, check_linear_in_weights
+from ._plan import Plan, check_linear_in_weights, plan_unless_traced
+from ._settings import LightAtSplats, RenderSettings
 from ._surface import ShadedSurface, SurfaceSamples, compose, layers_at_points
 
 Parameters = TypeVar("Parameters", bound=PyTree)
@@ -38,12 +40,18 @@ class PictureJacobian(eqx.Module):
     weights: Float[Array, "gaussians height width channels"]
     variances: Float[Array, "gaussians height width channels"]
 
-    def along(self, change: SumOfGaussians) -> Float[Array, "height width channels"]:
-        """Differentiate `beauty` along a change of weights and variances; return a derivative
-        picture.
+    def along(self, variances: Numbers, weights: Numbers) -> Float[Array, "height width channels"]:
+        """Differentiate `beauty` along a change of variances, [gaussians], and weights, [gaussians,
+        channels]; return a derivative picture.
+
+        **Raises:** `ValueError` for a change of other shapes.
         """
-        return jnp.einsum("k,khwc->hwc", change.variances, self.variances) + jnp.einsum(
-            "kc,khwc->hwc", change.weights, self.weights
+        variances, weights = (as_floats(each, self.weights.dtype) for each in (variances, weights))
+        gaussians, _, _, channels = self.weights.shape
+        check_shape("variances", variances, (gaussians,), "as many as the picture has Gaussians")
+        check_shape("weights", weights, (gaussians, channels), "those of the picture's Gaussians")
+        return jnp.einsum("k,khwc->hwc", variances, self.variances) + jnp.einsum(
+            "kc,khwc->hwc", weights, self.weights
         )
 
     def through(
@@ -69,13 +77,13 @@ class PictureJacobian(eqx.Module):
 
         def linear_beauty(parameters):
             made = gaussians_of(parameters)
-            if made.weights.shape != shape:
-                raise ValueError(
-                    f"gaussians_of(parameters) has {list(made.weights.shape)} Gaussians and "
-                    f"channels, and the picture was made with {list(shape)}; give the function "
-                    "that made its material"
-                )
-            return self.along(jax.tree.map(lambda leaf: leaf.astype(self.weights.dtype), made))
+            check_shape(
+                "gaussians_of(parameters).weights",
+                made.weights,
+                shape,
+                "give the function that made the material of the picture",
+            )
+            return self.along(made.variances, made.weights)
 
         return jax.jacfwd(linear_beauty)(parameters)
 
@@ -114,8 +122,8 @@ def picture_jacobian(
             "single scattering, which is differentiated only at the splats; give "
             "lighting=LightAtSplats(), or a material without it"
         )
-    check_linear_in_weights(settings)
     plan = plan_unless_traced(scene, camera, settings, plan)
+    check_linear_in_weights(settings, plan)
     scene, plan, _, own_rows = pad_scene(scene, plan, None, camera)
     jacobian = own_rows.of(_picture_jacobian(scene, camera, settings, plan), "weights", "variances")
     return dataclasses.replace(jacobian, frame=own_rows.frame(jacobian.frame))

@@ -17,10 +17,11 @@ from splatjax.scene import (
     GaussianBeam,
     Material,
     Scene,
-    Splats,
     StackedLights,
     stack_lights,
 )
+
+from ._surface import surface_parameters
 
 _GRAZING = 1e-3  # cosine
 _NEARLY = 1.05  # least light distance, in bounding radii, for one frustum around all splats
@@ -80,7 +81,9 @@ def shadow_views(
 ) -> Sequence[_splatting.AbstractView]:
     """Return the views of a light's shadow maps: one of all splats, or the six faces of a cube."""
     if isinstance(light, DirectionalLight | GaussianBeam):
-        return [_splatting.distant_view(light.direction, bounds, settings)]
+        towards = getattr(light, "shadow_towards", None)
+        direction = light.direction if towards is None else -towards
+        return [_splatting.distant_view(direction, bounds, settings)]
     if not isinstance(light, AbstractPointSample):
         raise ValueError(
             f"{type(light).__name__} has no shadow map; give a light with cast_shadows=False"
@@ -99,10 +102,12 @@ class Transfer(eqx.Module):
     - `visibility`: for each kind of lights the visibility of each sample, along the splats in the
       order of the plan; `None` for lights that cast no shadows.
     - `needed`: needed capacity divided by planned capacity.
+    - `places`: the directions and positions of the lights.
     """
 
     visibility: list[Float[Array, "_samples splats"] | None]
     needed: Float[Array, ""]
+    places: tuple[dict[str, Array], ...] = ()
 
 
 class LightVisibility(eqx.Module):
@@ -283,15 +288,6 @@ def single_scattering_at_splats(
     )
     f0 = _shading.fresnel_f0(scene.material.eta)
     return _shading.single_scattered_radiance(points, light.groups, f0, single)
-
-
-def surface_parameters(
-    material: Material, splats: Splats
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Multiply the material's specular strength and roughness with the splats' own."""
-    specular = material.specular if splats.specular is None else material.specular * splats.specular
-    factor = splats.roughness
-    return specular, material.roughness if factor is None else material.roughness * factor
 
 
 def beams_at_splats(

@@ -24,7 +24,6 @@ from ._lighting import (
     cast_shadows,
     irradiance_at_splats,
     source_derivative,
-    surface_parameters,
 )
 from ._plan import Plan
 from ._settings import RenderSettings
@@ -34,6 +33,7 @@ from ._surface import (
     SurfaceSamples,
     map_places,
     shade,
+    surface_parameters,
 )
 
 

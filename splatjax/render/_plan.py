@@ -12,10 +12,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceShardin
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import Result, rounded_up
+from splatjax._chunking import Result
 from splatjax._combination import DeviceMesh
-from splatjax._records import is_traced
-from splatjax.cache import kept, reuse_capacity
+from splatjax._records import check_class, is_traced
+from splatjax.cache import kept
 from splatjax.gaussians import pad_gaussians
 from splatjax.scene import (
     AbstractLight,
@@ -24,16 +24,17 @@ from splatjax.scene import (
     DistantStratum,
     Scene,
     Splats,
+    light_kinds,
     lights_by_kind,
 )
 
-from ._checks import check_planned, check_scene, in_one_dtype
+from ._checks import check_channels, check_planned, check_scene, in_one_dtype
 from ._lighting import ShadowPlan, plan_views
+from ._parts import cut_and_order
 from ._settings import RenderSettings
 
 # Directions on the whole sphere, for which the shadow maps of any environment are planned.
 _DIRECTIONS = [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z]
-_MOST_SPLATS = 1.06  # largest padded splat count over a scene's own count, to reuse a program
 
 
 class Plan(eqx.Module):
@@ -57,6 +58,7 @@ class Plan(eqx.Module):
     - `sightlines`: the visibility between splats; `None` without bounces.
     - `mesh`: the devices of the splats; `None` for one. Static.
     - `splats`, `gaussians`: number of splats, and of Gaussians. Static.
+    - `lights`: the kinds of lights. Static.
     """
 
     order: Int[Array, " places"]
@@ -70,6 +72,7 @@ class Plan(eqx.Module):
     mesh: Mesh | None = eqx.field(static=True)
     splats: int = eqx.field(static=True)
     gaussians: int = eqx.field(static=True)
+    lights: tuple[str, ...] = eqx.field(static=True)
 
     def specs(self, combination: DeviceMesh) -> "Plan":
         """Specify the arrays that are replicated, and those that are divided over the devices."""
@@ -123,6 +126,9 @@ def make_plan(
     cameras = list(cameras) if isinstance(cameras, Sequence) else [cameras]
     scenes = list(scenes) if isinstance(scenes, Sequence) else [scenes]
     check_planned(scenes, cameras)
+    check_class("settings", settings, RenderSettings)
+    if is_traced((scenes, cameras)):
+        raise ValueError("make_plan needs concrete arrays; call it outside of jit, grad and vmap")
     (scene, *other_scenes), cameras = _on_one_device((scenes, cameras))
     scene, other_scenes, cameras = in_one_dtype(scene, other_scenes, cameras)
     # The view of each camera, and that of the largest picture that shares its program.
@@ -132,7 +138,7 @@ def make_plan(
         for view, camera in zip(views, cameras, strict=True)
         if (view.width, view.height) != (camera.width, camera.height)
     ]
-    parts, order, exists = _cut_and_order(scene.splats, mesh)
+    parts, order, exists = cut_and_order(scene.splats, mesh)
     # Only the rasterizer plans device by device; the others, for the splats of all.
     splats = parts[0] if mesh is None else jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
     bounds, interval, splatting = _measure(splats, settings)
@@ -157,6 +163,7 @@ def make_plan(
         mesh=mesh,
         splats=scene.splats.count,
         gaussians=len(gaussians.variances),
+        lights=light_kinds(scene.lights),
     )
     if mesh is None:
         return plan
@@ -166,16 +173,11 @@ def make_plan(
     )
 
 
-def splats_per_device(count: int, mesh: Mesh | None) -> tuple[int, int]:
-    """Return the number of devices, and the number of splats of each, at least one."""
-    devices = 1 if mesh is None else mesh.size
-    return devices, max(-(-count // devices), 1)
-
-
-def check_plan(plan: Plan, scene: Scene, mesh: Mesh | None = None) -> None:
+def check_plan(plan: Plan, scene: Scene, mesh: Mesh | None = None, is_lit: bool = True) -> None:
     """Raise `ValueError` for a plan that was made for other splats, another number of Gaussians,
-    or another mesh.
+    other kinds of lights, or another mesh.
     """
+    check_class("plan", plan, Plan)
     for name, planned, count in (
         ("splats", plan.splats, scene.splats.count),
         ("Gaussians", plan.gaussians, len(scene.material.gaussians.variances)),
@@ -184,10 +186,44 @@ def check_plan(plan: Plan, scene: Scene, mesh: Mesh | None = None) -> None:
             raise ValueError(
                 f"the plan is for {planned} {name}, and the scene has {count}; make another plan"
             )
+    if is_lit and plan.lights != (kinds := light_kinds(scene.lights)):
+        raise ValueError(
+            f"the plan is for lights of the kinds {list(plan.lights)}, and the scene has "
+            f"{list(kinds)}; make another plan"
+        )
     if mesh is not None and plan.mesh != mesh:
         raise ValueError(
             f"the plan is for {plan.mesh or 'one device'}, not for {mesh}; make it with "
             "splatjax.make_plan(..., mesh=mesh)"
+        )
+
+
+def check_lit(scene: Scene, plan: Plan, settings: RenderSettings) -> None:
+    """Check the arguments of passes 1 and 4 without a camera."""
+    for name, value, kind in (
+        ("scene", scene, Scene),
+        ("plan", plan, Plan),
+        ("settings", settings, RenderSettings),
+    ):
+        check_class(name, value, kind)
+    check_channels(scene)
+    check_plan(plan, scene)
+
+
+def check_linear_in_weights(settings: RenderSettings, plan: Plan) -> None:
+    """Raise `ValueError` for bounces, with which a picture is not linear in the weights, and for a
+    plan without separate layers.
+    """
+    if not plan.diffusion.separate:
+        layers = getattr(settings.diffuser, "layers", _diffusion.ClusterDiffuser())
+        raise ValueError(
+            f"the plan is for {type(settings.diffuser).__name__}, which has no separate layers; "
+            f"make it with settings of diffuser={layers}"
+        )
+    if settings.bounces:
+        raise ValueError(
+            f"settings.bounces is {settings.bounces}, and each bounce depends on the material's "
+            "weights; give bounces=0, or differentiate splatjax.render in reverse mode"
         )
 
 
@@ -204,9 +240,10 @@ def plan_unless_traced(
     **Raises:** `ValueError` for a plan of other splats or another mesh, or when none is given under
     `jit`, `grad` or `vmap`.
     """
+    check_class("settings", settings, RenderSettings)
     check_scene(scene, camera, is_lit)
     if plan is not None:
-        check_plan(plan, scene, mesh)
+        check_plan(plan, scene, mesh, is_lit)
         return plan
     if is_traced((scene, camera)):
         raise ValueError(
@@ -226,47 +263,6 @@ def _on_one_device(tree: Result) -> Result:
         return jnp.asarray(np.asarray(array))
 
     return jax.tree.map(gathered, tree)
-
-
-def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Array, Array]:
-    """Divide the splats into a part for each device, in a compact order; also return the orders,
-    and whether their entries exist, device after device.
-    """
-    devices, per_device = splats_per_device(splats.count, mesh)
-    places = rounded_up(per_device, _diffusion.POINTS_PER_BLOCK, per_octave=16)
-    places = reuse_capacity("splats", per_device, places, most=_MOST_SPLATS)
-    repeated = (0, places - per_device)
-    padded = jax.tree.map(np.asarray, pad_splats(splats, per_device * devices))
-    parts, orders, exist = [], [], []
-    for first in range(0, per_device * devices, per_device):
-        part = jax.tree.map(lambda leaf, i=first: leaf[i : i + per_device], padded)
-        order = _diffusion.compact_order(part.centers).astype(np.int32)
-        exist.append(np.pad(first + order < splats.count, repeated))
-        orders.append(np.pad(order, repeated, mode="edge"))
-        parts.append(jax.tree.map(jnp.asarray, arrange(part, orders[-1], exist[-1])))
-    return parts, jnp.asarray(np.concatenate(orders)), jnp.asarray(np.concatenate(exist))
-
-
-def pad_splats(splats: Splats, count: int) -> Splats:
-    """Add invisible splats without light, up to `count`."""
-    if splats.count == count:
-        return splats
-    return splats.take(jnp.arange(count, dtype=jnp.int32))
-
-
-def arrange(
-    splats: Splats,
-    order: Int[Array, " places"] | Int[np.ndarray, " places"],
-    exists: Bool[Array, " places"] | Bool[np.ndarray, " places"],
-) -> Splats:
-    """Sort a device's splats in the order of a plan; repeated ones are invisible and dark."""
-    placed = jax.tree.map(lambda leaf: leaf[order], splats)
-    where = np.where if isinstance(placed.radii, np.ndarray) else jnp.where
-    return eqx.tree_at(
-        lambda splats: (splats.normals, splats.radii, splats.areas),
-        placed,
-        replace_fn=lambda leaf: where(exists.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0),
-    )
 
 
 @eqx.filter_jit
@@ -310,7 +306,10 @@ def _plan_shadows(
         return None
     if isinstance(lights[0], DistantStratum):
         directions = jnp.asarray(_DIRECTIONS, lights[0].direction.dtype)
-        lights = [dataclasses.replace(lights[0], direction=direction) for direction in directions]
+        lights = [
+            dataclasses.replace(lights[0], direction=direction, shadow_towards=None)
+            for direction in directions
+        ]
     areas = np.concatenate([np.asarray(part.areas) for part in parts])
     spacing = float(np.sqrt(np.mean(areas[areas > 0]))) if np.any(areas > 0) else np.inf
     shadows = settings.shadows_of(lights[0]).for_spacing(spacing, bounds)

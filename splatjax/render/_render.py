@@ -9,16 +9,18 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
 from splatjax._combination import lay_out
+from splatjax._records import Numbers, as_floats, check_values, precision_of
 from splatjax.cache import kept_jit
 from splatjax.diffusion import Sources
 from splatjax.scene import Camera, Frame, Scene
 from splatjax.splatting import PerspectiveView, invalid_factor
 
-from ._checks import check_channels
-from ._devices import cut_frame, cut_to, on_devices, pad_scene, resize_visibility
+from ._checks import check_shape
+from ._devices import cut_frame, cut_to, on_devices, pad_scene, places_of, resize_visibility
 from ._lighting import Irradiance, Transfer
+from ._parts import splats_per_device
 from ._passes import SplatLight
-from ._plan import Plan, check_plan, plan_unless_traced, splats_per_device
+from ._plan import Plan, check_lit, plan_unless_traced
 from ._settings import LightAtSplats, RenderSettings
 from ._surface import compose
 
@@ -109,8 +111,7 @@ def illuminate(
     **Raises:** `ValueError` when the channels disagree, or the plan is for another number of
     splats.
     """
-    check_channels(scene)
-    check_plan(plan, scene)
+    check_lit(scene, plan, settings)
     filled, plan, light, _ = pad_scene(scene, plan, light)
     return resize_visibility(_illuminate(filled, plan, settings, derivative, light), scene)
 
@@ -139,14 +140,15 @@ def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings
 
     **Arguments:** as for `illuminate`.
 
-    **Returns:** a `Transfer`: 4 bytes for each splat and sample in float32.
+    **Returns:** a `Transfer`: 4 bytes for each splat and sample in float32. It is refused for
+    lights in other directions or at other positions.
 
     **Raises:** `ValueError` as `illuminate` does.
     """
-    check_channels(scene)
-    check_plan(plan, scene)
+    check_lit(scene, plan, settings)
     filled, plan, *_ = pad_scene(scene, plan)
-    return resize_visibility(_transfer(filled, plan, settings), scene)
+    kept = resize_visibility(_transfer(filled, plan, settings), scene)
+    return dataclasses.replace(kept, places=places_of(scene.lights))
 
 
 @kept_jit
@@ -170,8 +172,7 @@ def compute_irradiance(
 
     **Raises:** `ValueError` as `illuminate` does.
     """
-    check_channels(scene)
-    check_plan(plan, scene)
+    check_lit(scene, plan, settings)
     return _compute_irradiance(scene, plan, settings)
 
 
@@ -199,7 +200,7 @@ def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> I
 
 def diffuse_irradiance(
     scene: Scene,
-    irradiance: Float[Array, "splats channels"],
+    irradiance: Numbers,
     camera: Camera,
     settings: RenderSettings = RenderSettings(),
     plan: Plan | None = None,
@@ -210,21 +211,21 @@ def diffuse_irradiance(
     **Arguments:** as for `render`; only the splats' geometry and albedo and the material's
     Gaussians are used.
 
-    - `irradiance`: the light that enters each splat, in the channels of the material's weights.
-      Differentiable.
+    - `irradiance`: the light that enters each splat, [splats, channels], in the channels of the
+      material, at least 0: pass 4 limits layers to positive values. For light of both signs,
+      diffuse `irradiance + c`, and subtract the layers of `c`. Differentiable.
 
     **Returns:** one layer per Gaussian on the front surface, 0 where no surface is visible, and NaN
     if the plan does not suffice. Their sum weighted by `material.gaussians.weights` is the radiant
     exitance.
 
-    **Raises:** `ValueError` when a plan is needed and not given, or when the channels disagree.
+    **Raises:** `ValueError` when a plan is needed and not given, or for irradiance of another shape
+    or below 0.
     """
-    channels = scene.material.gaussians.weights.shape[1]
-    if irradiance.shape[1] != channels:
-        raise ValueError(
-            f"irradiance has {irradiance.shape[1]} channels, material.gaussians.weights has "
-            f"{channels}; give both the same number"
-        )
+    irradiance = as_floats(irradiance, precision_of([irradiance, scene]), "irradiance")
+    shape = scene.splats.count, scene.material.channels
+    check_shape("irradiance", irradiance, shape, "give a row for each splat, with all channels")
+    check_values("irradiance", irradiance, "at least 0: add a constant to it", lambda x: x >= 0)
     plan = plan_unless_traced(scene, camera, settings, plan, is_lit=False)
     return _diffuse_irradiance(scene, irradiance, camera, settings, plan)
 

@@ -19,9 +19,8 @@ from ._lighting import (
     Irradiance,
     LightVisibility,
     single_scattering_at_splats,
-    surface_parameters,
 )
-from ._surface import SurfaceAttributes, SurfaceSamples
+from ._surface import SurfaceAttributes, SurfaceSamples, surface_parameters
 
 
 class AbstractLighting(eqx.Module):
@@ -124,20 +123,3 @@ class RenderSettings(eqx.Module):
         """Return the settings of the shadow maps of a light or sample."""
         is_sample = isinstance(light, DistantStratum | EmitterStratum)
         return self.sample_shadows if is_sample else self.shadows
-
-
-def check_linear_in_weights(settings: RenderSettings) -> None:
-    """Raise `ValueError` for bounces, with which a picture is not linear in the weights, and for a
-    diffuser without separate layers.
-    """
-    if isinstance(settings.diffuser, _diffusion.ExitanceDiffuser | _diffusion.ShapeDiffuser):
-        layers = getattr(settings.diffuser, "layers", _diffusion.ClusterDiffuser())
-        raise ValueError(
-            f"settings.diffuser is {type(settings.diffuser).__name__}, which has no separate "
-            f"layers; give diffuser={layers}"
-        )
-    if settings.bounces:
-        raise ValueError(
-            f"settings.bounces is {settings.bounces}, and each bounce depends on the material's "
-            "weights; give bounces=0, or differentiate splatjax.render in reverse mode"
-        )

@@ -35,8 +35,8 @@ from ._lighting import (
     map_visibility,
     plan_views,
 )
+from ._parts import pad_splats
 from ._passes import sample_surfaces
-from ._plan import pad_splats
 from ._settings import RenderSettings
 from ._statistics import ReplayableStream, measure_stream
 from ._surface import (
@@ -50,7 +50,7 @@ from ._surface import (
 
 def render_streamed(
     parts: Parts,
-    lights: Sequence[AbstractLight],
+    lights: AbstractLight | Sequence[AbstractLight],
     material: Material,
     camera: Camera,
     settings: RenderSettings = RenderSettings(),
@@ -76,6 +76,11 @@ def render_streamed(
     **Raises:** `ValueError` when there are no splats, parts differ in size, are not the same each
     time, or the settings cannot be streamed.
     """
+    if not callable(parts):
+        raise ValueError(
+            f"parts is a {type(parts).__name__}; give a function that iterates over the parts each "
+            "time it is called, such as lambda: iter(list_of_splats)"
+        )
     if settings.bounces:
         raise ValueError(
             f"settings.bounces is {settings.bounces}, and a stream does not support bounces; "
@@ -95,7 +100,7 @@ def render_streamed(
 
     def scenes(task: str) -> Iterator[Scene]:
         for part in stream(task):
-            yield in_one_dtype(Scene(pad_splats(part, part_size), tuple(lights), material))[0]
+            yield in_one_dtype(Scene(pad_splats(part, part_size), lights, material))[0]
 
     first = next(iter(scenes("looking")))
     check_channels(first)

@@ -12,7 +12,18 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
 from splatjax._chunking import Result, map_chunks
-from splatjax.scene import Frame, Scene, StackedLights
+from splatjax.scene import Frame, Material, Scene, Splats, StackedLights
+
+_NO_AREA = 1e-6  # mm^2, of splats without area
+
+
+def surface_parameters(
+    material: Material, splats: Splats
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Multiply the material's specular strength and roughness with the splats' own."""
+    specular = material.specular if splats.specular is None else material.specular * splats.specular
+    factor = splats.roughness
+    return specular, material.roughness if factor is None else material.roughness * factor
 
 
 class SurfaceAttributes(eqx.Module):
@@ -115,14 +126,14 @@ def layers_at_points(
       of the samples begin with its channels.
     - `gaussians`: of the layers, as in a plan.
     """
-    albedo = attributes.albedo
+    albedo, (area,) = attributes.albedo, attributes.area
     return _diffusion.LayersAtPoints.of(
         scene.material.gaussians.variances,
         gaussians,
         samples.layers,
         samples.derivative,
         source,
-        jnp.where(samples.covered, attributes.area[0], 1.0),
+        jnp.where(samples.covered & (area > 0), area, _NO_AREA),
         jnp.ones_like(source) if albedo is None else albedo,
         interval,
         kernel,

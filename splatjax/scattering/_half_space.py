@@ -246,8 +246,9 @@ def _directional_albedo(absorbed, eta, g, cover) -> Float[Array, " angles"]:
 @_directional_albedo.defjvp
 def _directional_albedo_jvp(primals, tangents):
     absorbed, eta, *others = primals  # near eta = 1 no cosine resolves the critical angle
-    primals = absorbed, jnp.maximum(eta, _LEAST_ETA), *others
-    return jax.jvp(_directional_albedo.fun, primals, tangents)
+    resolved = absorbed, jnp.maximum(eta, _LEAST_ETA), *others
+    _, tangent = jax.jvp(_directional_albedo.fun, resolved, tangents)
+    return _directional_albedo(*primals), tangent
 
 
 def _doubled(mu, weights, absorbed, g, optical_depth=None):

@@ -18,6 +18,7 @@ from ._formulas import (
     sun_and_sky as sun_and_sky,
 )
 from ._light_groups import (
+    light_kinds as light_kinds,
     lights_by_kind as lights_by_kind,
     stack_lights as stack_lights,
     StackedLights as StackedLights,

@@ -48,10 +48,10 @@ class EnvironmentLight(AbstractExtendedLight):
     - `strength`: factor of each channel. Differentiable.
     - `up`: the direction of the image's upper edge, of any nonzero length. With (0, 0, 1), for a
       world with z up, the middle of the image is -y. Differentiable.
-    - `directions`: world directions of the samples, of any nonzero length, to which the light of
-      nearby pixels is distributed; or `None` to choose the samples by the image. With given
-      directions, the visibility that `splatjax.transfer` computes is valid for every image and
-      rotation.
+    - `directions`: world directions of the samples, of any nonzero length; or `None` to choose the
+      samples by the image. The light of each pixel is distributed to the directions near it. The
+      shadow maps are rendered along these directions, so the visibility that `splatjax.transfer`
+      computes is exact for every image and rotation.
     - `count`: number of samples if the image chooses them. Static.
     - `cast_shadows`: whether the samples have shadow maps. Static.
 
@@ -119,9 +119,11 @@ class EnvironmentLight(AbstractExtendedLight):
         is_filled = jnp.sum(towards**2, axis=-1, keepdims=True) > 0
         towards = jnp.where(is_filled, towards, jnp.asarray([[0.0, 1.0, 0.0]], towards.dtype))
         towards = towards / jnp.linalg.norm(towards, axis=-1, keepdims=True) @ self.to_world().T
-        return jax.vmap(eqx.Partial(DistantStratum, cast_shadows=self.cast_shadows))(
-            -towards, irradiance
-        )
+        return jax.vmap(
+            lambda direction, irradiance, shadow_towards: DistantStratum(
+                direction, irradiance, self.cast_shadows, shadow_towards
+            )
+        )(-towards, irradiance, self.directions)
 
     def _distribute(
         self, directions: Float[Array, "height width 3"], moments: Float[Array, "height width sums"]

@@ -54,6 +54,15 @@ def lights_by_kind(
     return [kinds[kind] for kind in sorted(kinds, key=str)]
 
 
+def light_kinds(lights: tuple[AbstractLight, ...]) -> tuple[str, ...]:
+    """Name each kind of samples of lights."""
+    samples = [group[0][1] for group in lights_by_kind(lights)]
+    return tuple(
+        type(sample).__name__ + ("" if sample.cast_shadows else " without shadows")
+        for sample in samples
+    )
+
+
 def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
     """Stack samples of the same kind, so that one loop computes any number of them."""
     groups = []

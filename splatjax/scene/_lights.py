@@ -265,7 +265,15 @@ class SpotLight(AbstractPointSample):
 
 
 class DistantStratum(DirectionalLight):
-    """A part of an environment, treated as parallel light."""
+    """A part of an environment, treated as parallel light.
+
+    **Attributes:**
+
+    - `shadow_towards`: the direction in which the shadow map sees the light. `None`: opposite to
+      `direction`.
+    """
+
+    shadow_towards: Float[Array, "3"] | None = None
 
 
 class EmitterStratum(PointLight):

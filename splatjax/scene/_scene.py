@@ -19,6 +19,7 @@ from splatjax._records import (
     check_values,
     is_traced,
     numbers,
+    plain_int,
     record,
     require,
     several,
@@ -62,8 +63,8 @@ class Camera(eqx.Module):
     focal_length: Float[Array, ""] = eqx.field(
         converter=numbers, metadata=valid("positive", lambda x: x > 0)
     )
-    width: int = eqx.field(static=True, metadata=_PIXELS)
-    height: int = eqx.field(static=True, metadata=_PIXELS)
+    width: int = eqx.field(static=True, converter=plain_int, metadata=_PIXELS)
+    height: int = eqx.field(static=True, converter=plain_int, metadata=_PIXELS)
     near: float = eqx.field(static=True, default=1e-2)
     principal_point: Float[Array, "2"] | None = eqx.field(
         converter=numbers, default=None, metadata=valid("finite (over width and height)")
@@ -73,9 +74,9 @@ class Camera(eqx.Module):
         if isinstance(self.rotation, jax.Array) and not is_traced(self.rotation):
             rotation = np.asarray(self.rotation, float)
             check_values(
-                "products of the rows of Camera.rotation, minus the identity,",
-                rotation @ rotation.T - np.eye(3),
-                "0: rows are orthonormal",
+                "products of the rows of Camera.rotation minus the identity, and its hand minus 1,",
+                np.append(rotation @ rotation.T - np.eye(3), np.sign(np.linalg.det(rotation)) - 1),
+                "0: right, down and forward are orthonormal and right-handed",
                 lambda x: np.abs(x) < _ORTHONORMAL,
             )
 
@@ -261,8 +262,7 @@ class Scene(eqx.Module):
     **Attributes:** (differentiable)
 
     - `splats`: the surface of the body.
-    - `lights`: one light or several. A light of one channel applies to every channel of
-      the material. Lights of one kind are computed together.
+    - `lights`: one light or several. A light of one channel applies to all channels.
     - `material`: the material of all splats. For splats with an albedo, use `material.white()`, so
       that the albedo alone determines the color.
     """

@@ -25,6 +25,10 @@ from ._views import CLOSED, AbstractView, SplattingSettings
 # in pictures makes its shadow extend less. Evenly spread splats always exceed a sum of 1.
 _COVERED = 2 * CLOSED
 _LEAST_RESOLUTION = 64
+_RESOLUTIONS = valid("at least 8 (pixels)", lambda n: n >= 8)
+_COMPARED = valid("2 or 3 (pixels)", lambda n: (n == 2) | (n == 3))
+_NOT_NEGATIVE = valid("at least 0", lambda x: x >= 0)
+_POSITIVE = valid("positive", lambda x: x > 0)
 _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 
 
@@ -55,23 +59,18 @@ class ShadowSettings(eqx.Module):
     - `filled`: side, in pixels, of the part of the map that shows the body. `None` to derive it.
     """
 
-    resolution: int = eqx.field(static=True, default=1024)
-    bias: float = eqx.field(static=True, default=0.2)
-    softness: float = eqx.field(static=True, default=0.4)
-    largest_slope: float = eqx.field(static=True, default=8.0)
-    compared: int = eqx.field(
-        static=True, default=3, metadata=valid("2 or 3 (pixels)", lambda n: (n == 2) | (n == 3))
-    )
-    merged_spacing: float = eqx.field(static=True, default=0.0)
+    resolution: int = eqx.field(static=True, default=1024, metadata=_RESOLUTIONS)
+    bias: float = eqx.field(static=True, default=0.2, metadata=_NOT_NEGATIVE)
+    softness: float = eqx.field(static=True, default=0.4, metadata=_POSITIVE)
+    largest_slope: float = eqx.field(static=True, default=8.0, metadata=_POSITIVE)
+    compared: int = eqx.field(static=True, default=3, metadata=_COMPARED)
+    merged_spacing: float = eqx.field(static=True, default=0.0, metadata=_NOT_NEGATIVE)
     pixels_per_spacing: float = eqx.field(
         static=True,
         default=4.0,
         metadata=valid("positive; inf for the full resolution", lambda x: x > 0, finite=False),
     )
-
-    filled: float | Float[Array, ""] | None = eqx.field(
-        default=None, metadata=valid("positive (pixels)", lambda x: x > 0)
-    )
+    filled: float | Float[Array, ""] | None = eqx.field(default=None, metadata=_POSITIVE)
 
     @property
     def side(self) -> int | float | Float[Array, ""]:
@@ -188,12 +187,14 @@ def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[Pe
 
 
 def in_cube_face(view: AbstractView, points: Float[Array, "3 splats"]) -> Float[Array, " splats"]:
-    """Mark (1 or 0) the points that belong to a face of the cube: those whose largest coordinate is
-    along its axis.
+    """Return 1 for the points that belong to a face of the cube, those whose largest coordinate is
+    along its axis, and 0 for others. A point between faces belongs to each of them in equal parts.
     """
     offset = points - view.position[:, None]
-    along = jnp.tensordot(view.rotation[2], offset, 1)
-    return (along >= jnp.max(jnp.abs(offset), axis=0) * (1 - 1e-6)).astype(points.dtype)
+    along, away = jnp.tensordot(view.rotation[2], offset, 1), jnp.abs(offset)
+    largest = jnp.max(away, axis=0) * (1 - 1e-6)
+    faces = jnp.sum(away >= largest[None], axis=0).astype(points.dtype)
+    return jnp.where(along >= largest, 1 / faces, 0.0)
 
 
 class ShadowMap(eqx.Module):

@@ -48,9 +48,15 @@ class SplattingSettings(eqx.Module):
       positive. `None` to derive it from the splats (`measured`).
     """
 
-    filter_radius: float = eqx.field(static=True, default=2**0.5)
-    epsilon_z: float = eqx.field(static=True, default=1.5)
-    largest_slope: float = eqx.field(static=True, default=3.0)
+    filter_radius: float = eqx.field(
+        static=True, default=2**0.5, metadata=valid("positive (pixels)", lambda x: x > 0)
+    )
+    epsilon_z: float = eqx.field(
+        static=True, default=1.5, metadata=valid("positive (radii)", lambda x: x > 0)
+    )
+    largest_slope: float = eqx.field(
+        static=True, default=3.0, metadata=valid("at least 1", lambda x: x >= 1)
+    )
     full_coverage: float | Float[Array, ""] | None = eqx.field(
         default=None, metadata=valid("positive", lambda x: x > 0)
     )

@@ -5,8 +5,10 @@ versions, and words that it does not know.
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 import warnings
 from unittest import mock
 
@@ -208,6 +210,32 @@ def test_status_tells_whose_fault_it_is(error, status, named, monkeypatch, capsy
     assert (captured.out, captured.err.count("\n")) == ("", 1)
     assert captured.err.startswith("splatjax: ")
     assert named in captured.err
+
+
+BUSY = """
+import ctypes
+from splatjax.cli import _main
+
+def wait_outside_python():
+    mutex, lock = ctypes.create_string_buffer(64), ctypes.CDLL(None).pthread_mutex_lock
+    lock(mutex)
+    print("busy", flush=True)
+    lock(mutex)
+
+_main.main = wait_outside_python
+_main.run_and_exit()
+"""
+
+
+@pytest.mark.once
+def test_an_interruption_ends_a_program_that_does_not_notice_it():
+    words, pipe = [sys.executable, "-c", BUSY], subprocess.PIPE
+    with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout.readline() == "busy\n"
+        time.sleep(1)  # until it waits
+        process.send_signal(signal.SIGINT)
+        _, printed = process.communicate(timeout=300)
+    assert (process.returncode, printed) == (130, "splatjax: interrupted\n")
 
 
 @pytest.mark.parametrize("words", [["--debug", "materials"], ["materials", "--debug"]])

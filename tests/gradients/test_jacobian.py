@@ -94,7 +94,7 @@ def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
         for at, value in enumerate(coefficients[name]):
             ends = fitted(name, at, step), fitted(name, at, -step)
             slope = jax.tree.map(lambda a, b, v=value: (a - b) / (2 * step * v), *ends)
-            expected = of_gaussians.along(slope)
+            expected = of_gaussians.along(slope.variances, slope.weights)
             largest = np.max(np.abs(expected))
             assert largest > 0
             np.testing.assert_allclose(
@@ -102,7 +102,7 @@ def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
             )
     bodies.assert_refused(
         lambda: of_gaussians.through(lambda w: sj.SumOfGaussians(jnp.ones(1), w), jnp.ones((1, 2))),
-        r"\[1, 2\] Gaussians .* was made with \[2, 2\]",
+        r"weights has shape \[1, 2\], not \[2, 2\]",
     )
 
 

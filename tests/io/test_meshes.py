@@ -73,6 +73,12 @@ def test_files_of_trimesh(tmp_path, suffix, body):
     path, linear = export(mesh, tmp_path, suffix), None if is_bare else linear
     compare(path, vertices, faces, None if is_bare else normals, linear)
     compare(path, vertices[:, [0, 2, 1]] * [1, 1, -1], faces, None, linear, up="z")
+    albedo = sj.sample_mesh(path, 500, mm_per_unit=MM).albedo
+    assert (albedo is None) == is_bare
+    if not is_bare:
+        albedo = np.asarray(albedo)
+        assert np.all((albedo > linear.min(axis=0) - 1e-4) & (albedo < linear.max(axis=0) + 1e-4))
+        assert np.all(np.std(albedo, axis=0) > 0.01)
 
 
 @pytest.mark.parametrize("kind", ["ply", "ascii.ply", "obj", "stl", "ascii.stl", "off"])

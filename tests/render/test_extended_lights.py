@@ -377,6 +377,31 @@ def test_irradiance_on_a_ball_is_that_of_its_bands(count):
 
 
 @pytest.mark.once
+def test_visibility_from_given_directions_serves_every_environment():
+    """Kept for one image and rotation, it is that of others."""
+    images = np.random.default_rng(1).uniform(size=(2, 8, 16, 3))
+    directions = sj.scene.even_directions(12)
+    scenes = [
+        sj.Scene(TWO_BALLS, sj.EnvironmentLight(image, turn, directions=directions), SCATTERED_ONCE)
+        for image, turn in zip(images, (0.0, 70.0), strict=True)
+    ]
+    plan = sj.make_plan(scenes[0], CAMERA, PLAIN)
+    kept = sj.transfer(scenes[0], plan, PLAIN)
+    again, anew = (
+        sj.render(scenes[1], CAMERA, PLAIN, plan, light=light).beauty for light in (kept, None)
+    )
+    np.testing.assert_allclose(again, anew, atol=1e-6)
+    assert float(jnp.max(anew)) > 0.1
+    for others in (-directions, None):
+        changed = sj.EnvironmentLight(images[1], directions=others, count=12)
+        scene = sj.Scene(TWO_BALLS, changed, SCATTERED_ONCE)
+        assert_refused(
+            lambda scene=scene: sj.render(scene, CAMERA, PLAIN, plan, light=kept),
+            "lights in other directions",
+        )
+
+
+@pytest.mark.once
 def test_a_harmonic_light_of_one_channel_is_gray():
     light = HarmonicLight([[1.0], [0.3], [-0.2], [0.1]], count=64, cast_shadows=False)
     gaussians = sj.SumOfGaussians([1.0], np.ones((1, 3)))

@@ -76,6 +76,10 @@ def test_a_lamp_among_the_splats_in_one_scene_has_six_faces_in_all():
     assert not sj.make_plan([far, far], CAMERA, SETTINGS).shadows[0].cube
 
 
+def diffused(irradiance) -> jax.Array:
+    return sj.diffuse_irradiance(SCENE, irradiance, CAMERA, SETTINGS, planned())
+
+
 SCENE, OTHER = (scene_under(lamp(0, 0, -1), splats=sheet(half, 1.0)) for half in (5.0, 4.0))
 
 
@@ -95,6 +99,10 @@ NOT_PLANNED = [
     (
         sj.Scene(SCENE.splats, SCENE.lights, sj.load_material("skin")),
         "2 Gaussians, and the scene has 6",
+    ),
+    (
+        scene_under(sj.PointLight([0, 0, 30], 1.0), splats=SCENE.splats),
+        r"kinds \['DirectionalLight'\], and the scene has \['PointLight'\]",
     ),
 ]
 REFUSED = [
@@ -162,7 +170,56 @@ REFUSED = [
         ),
         r"1000000 x 1000000 pixels .* 5e\+05 GB",
     ),
+    *(
+        (partial(diffused, rows), r"irradiance has shape .* \[\d+, 3\]; give a row for each splat")
+        for rows in (np.ones((1, 3)), np.ones((len(SCENE.splats.radii), 2)), [1.0, 1.0, 1.0])
+    ),
+    (
+        partial(diffused, np.full((len(SCENE.splats.radii), 3), -0.5)),
+        "irradiance must be at least 0: add a constant.* -0.5",
+    ),
+    (
+        lambda: sj.diffusion_basis(SCENE, CAMERA, SETTINGS, planned()).beauty(
+            sj.SumOfGaussians([1.0], np.ones((1, 3)))
+        ),
+        r"gaussians.weights has shape \[1, 3\], not \[2, 3\]",
+    ),
+    (
+        lambda: sj.diffusion_basis(
+            SCENE,
+            CAMERA,
+            SETTINGS,
+            planned(),
+            derivative=True,
+            light=sj.illuminate(SCENE, planned(), SETTINGS),
+        ),
+        r"light has no derivative; compute it by illuminate\(..., derivative=True\)",
+    ),
+    (
+        lambda: sj.render(
+            scene_under(lamp(0, 0.1, -1), splats=SCENE.splats),
+            CAMERA,
+            SETTINGS,
+            planned(),
+            light=sj.transfer(SCENE, planned(), SETTINGS),
+        ),
+        "lights in other directions",
+    ),
+    (
+        lambda: jax.jit(lambda scene: sj.make_plan(scene, CAMERA, SETTINGS))(SCENE),
+        "make_plan needs concrete arrays",
+    ),
 ]
+MISPLACED = [
+    (lambda: sj.render(SCENE, CAMERA, planned()), "settings must be RenderSettings"),
+    (lambda: sj.illuminate(SCENE, SETTINGS), "plan must be Plan"),
+    (lambda: sj.render(SCENE, CAMERA, light=lamp(0, 0, -1)), "light must be SplatLight.*Transfer"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), MISPLACED)
+def test_misplaced_arguments_are_refused_by_name(call, message, float64):
+    assert_refused(call, message)
 
 
 @pytest.mark.parametrize(("call", "message"), REFUSED)

@@ -136,7 +136,13 @@ REFUSED = [
     (lambda: of_a_sum(sj.diffusion_basis), "DenseDiffuser"),
     (lambda: of_a_sum(sj.picture_jacobian), "DenseDiffuser"),
     (
-        lambda: sj.diffusion_basis(replace(scene(sphere(100)), material=SOLVED[0]), *SEEN),
+        lambda: sj.diffusion_basis(
+            replace(
+                scene(sphere(100)),
+                material=sj.Material(two_gaussians(), medium=sj.Medium([0.02] * 3, 1.0, 1.3)),
+            ),
+            *SEEN,
+        ),
         "ShapeDiffuser.*ClusterDiffuser",
     ),
     (

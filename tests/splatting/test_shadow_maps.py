@@ -93,6 +93,10 @@ def test_every_point_belongs_to_one_face_of_the_cube():
         beyond = np.maximum(np.abs(x - half), np.abs(y - half)) - (half - 2)
         inside = (beyond < 0) & (depth > 2 * view.near)
         assert np.all((own == inside) | (np.abs(beyond) < 1e-3))
+    between = eye[:, None] + jnp.asarray([[2.0, -3, 1], [2, 3, -1], [1, 3, 1]])
+    shares = np.asarray([in_cube_face(view, between) for view in views])
+    np.testing.assert_allclose(shares.sum(axis=0), 1, rtol=1e-6)
+    np.testing.assert_allclose(np.max(shares, axis=0), [1 / 2, 1 / 3, 1 / 3], rtol=1e-6)
 
 
 def smooth_step(t):
