@@ -32,6 +32,9 @@ class Material(eqx.Module):
         material = Material.of_medium(Medium([0.02, 0.006, 0.015], [1.1, 1.3, 1.5], eta=1.6))
         material = Material(fit_gaussians(Dipole(load_medium("marble"))).gaussians, eta=1.5)
 
+    `of_medium` fixes the sum of the weights to the total reflectance. `fit_gaussians` does so only
+    with `weights=FixedTotalReflectance()`; otherwise the sum may differ by a few percent.
+
     **Attributes:** (differentiable, except `wavelengths`)
 
     - `gaussians`: the diffusion profile. The sum of its weights is the diffuse reflectance.
