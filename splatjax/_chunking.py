@@ -195,7 +195,13 @@ def rounded_up(count: int, step: int, per_octave: int = 8) -> int:
 
 
 def with_spare(
-    kind: Hashable, count: int, step: int, per_octave: int = 8, spare: float = 1.03, cheap: int = 0
+    kind: Hashable,
+    count: int,
+    step: int,
+    per_octave: int = 8,
+    spare: float = 1.03,
+    cheap: int = 0,
+    most: float = 1.25,
 ) -> int:
     """Plan the capacity of a kind of array for a count: `spare` times the count, at least one more,
     rounded up. An earlier capacity with that margin, or with 10%, is reused.
@@ -204,11 +210,12 @@ def with_spare(
 
     - `cheap`: a capacity that costs hardly any time. Up to it, twice the count is planned and every
       earlier capacity is reused, so that other bodies in small pictures share a program.
+    - `most`: the largest earlier capacity that is reused, over the one planned.
     """
     planned = max(int(count * spare), min(2 * count, cheap)) + 1
     capacity = rounded_up(planned, step, per_octave)
     least = int(count * min(spare, _LEAST_SPARE)) + 1
-    most = max(1 + 1 / per_octave, 1.25, cheap / capacity)
+    most = max(1 + 1 / per_octave, most, cheap / capacity)
     return reuse_capacity((kind, step, per_octave, spare), least, capacity, most)
 
 

@@ -17,6 +17,7 @@ from ._diffuser import Sources
 POINTS_PER_BLOCK = 32  # blocks, and their halves and quarters, are compact
 SOURCES_PER_BLOCK = 8
 _CHEAP = 1 << 15  # blocks of sources that take hardly any time
+_REUSED = 2.0  # largest earlier capacity that is reused, over the one planned
 _TOGETHER = 128 * POINTS_PER_BLOCK  # size of parts that are then halved together
 
 
@@ -61,7 +62,7 @@ class LayerSources(eqx.Module):
         layers, ends = np.repeat(np.arange(len(edges)), blocks), np.cumsum(blocks)
         parents = np.stack(cells_of_splats) + SOURCES_PER_BLOCK * (ends - blocks)[:, None]
         most = len(edges) * -(-len(exists) // SOURCES_PER_BLOCK)
-        planned = with_spare(("sources", most), len(layers), 256, cheap=_CHEAP)
+        planned = with_spare(("sources", most), len(layers), 256, cheap=_CHEAP, most=_REUSED)
         layers = np.pad(layers, (0, min(planned, most) - len(layers)))
         return cls(jnp.asarray(parents, jnp.int32), jnp.asarray(layers, jnp.int32))
 

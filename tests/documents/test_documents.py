@@ -286,7 +286,7 @@ def test_what_programs_name_is_there(page):
 @pytest.mark.slow
 def test_the_first_program_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sj.cache, "keep", lambda: None)
+    monkeypatch.setattr(sj.cache, "keep", lambda **_: None)
     first, *_ = fences(ROOT / "README.md", "python")
     exec(compile(_small(first), "README.md", "exec"), {})
     assert {path.name for path in tmp_path.iterdir()} == {"bust.exr", "bust.png"}
@@ -296,7 +296,7 @@ def test_the_first_program_of_the_readme_runs(tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", WITH_PROGRAMS)
 def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sj.cache, "keep", lambda: None)
+    monkeypatch.setattr(sj.cache, "keep", lambda **_: None)
     text = "\n".join(fences(page, "python"))
     lay_out(tmp_path, text)
     lay_out_frame(tmp_path, text)
