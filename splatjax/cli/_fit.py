@@ -31,7 +31,6 @@ from ._terminal import (
 
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
 # Error above which a note is printed, and the ratio of channel widths that explains it.
-_LARGE, _APART = 0.05, 3.0
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
 _OF_ALL = {"medium", "count", "model", "g", "output", "all"}
 # Options for only one kind of input.
@@ -191,7 +190,7 @@ class Fit:
                 f"{self.medium}: mean free path {paths} mm; the fit hardly weights smaller radii, "
                 "where errors of tens of percent are usual"
             )
-        self._note_error(target, fitted)
+        _models.note_error(self.medium, target, fitted)
         total = fitted.gaussians.total_reflectance()
         if float(total.max()) > 1 + 1e-3:
             note(
@@ -207,22 +206,6 @@ class Fit:
             title = f"{self.medium}, {counted(len(fitted.gaussians.variances), 'Gaussian')}"
             figure = plot_fit(target.profile, fitted.gaussians, rule=target.rule, title=title)
             save_figure(figure, self.plot)
-
-    def _note_error(self, target: _models.Reference, fitted: sj.fitting.FitResult) -> None:
-        """Print a note about a large error, and whether different widths of channels cause it."""
-        scales, count = target.profile.length_scale(), len(fitted.gaussians.variances)
-        error, ratio = float(fitted.error.max()), float(scales.max() / scales.min())
-        reason = (
-            f"the widths of its channels differ by a factor of {ratio:.2g}, too far apart to share "
-            f"{count} variances"
-            if ratio > _APART
-            else f"{counted(count, 'Gaussian')} cannot follow its profile"
-        )
-        if error > _LARGE:
-            note(
-                f"{self.medium}: {reason} (error {error:.2g}); give a larger --count, or --error "
-                f"{_LARGE}"
-            )
 
     def _target(self) -> tuple[_models.Coefficients | None, _models.Reference]:
         """Read the input, and return its coefficients (`None` if it is measured) and the profile to

@@ -13,8 +13,9 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 import splatjax as sj
+from splatjax._format import channel_names, counted
 
-from ._terminal import print_table, stage
+from ._terminal import note, print_table, stage
 
 Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carlo"]
 Coefficients: TypeAlias = (
@@ -22,6 +23,9 @@ Coefficients: TypeAlias = (
 )
 # Weights of the fit to a medium, which conserve the energy of the picture.
 MEDIUM_WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
+
+_LARGE = 0.05  # error of a fit that is worth a note
+_APART = 3.0  # ratio of the widths of channels, too large to share six variances
 
 
 def model_by_name(model: Model | None, g: float) -> sj.fitting.AbstractModel:
@@ -234,3 +238,31 @@ def print_fit(fitted: sj.fitting.FitResult, target: Reference) -> None:
         formatted = [f"{error:+.1%}" if is_counted else "-" for error, is_counted in cells]
         rows.append((f"{float(radii[i]):.3g}", "  ".join(formatted)))
     print_table(rows)
+
+
+def note_error(name: str, target: Reference, fitted: sj.fitting.FitResult) -> None:
+    """Print a note about a large error, and its reason: a profile that is negative, because its
+    color is outside sRGB, or different widths of channels.
+    """
+    error, profile = float(fitted.error.max()), target.profile
+    if error <= _LARGE:
+        return
+    radii, _ = target.rule.radii(profile)
+    values = np.asarray(sj.scattering.at_own_radii(profile, radii))
+    negative = np.any(values < 0, axis=0)
+    if np.any(negative):
+        colors = " and ".join(np.asarray(channel_names(len(negative)))[negative])
+        note(
+            f"{name}: its {colors} are negative from {radii[values < 0].min():.2g} mm on, outside "
+            f"sRGB, where no Gaussians can follow them (error {error:.2g}); their totals are right"
+        )
+        return
+    scales, count = profile.length_scale(), len(fitted.gaussians.variances)
+    ratio = float(scales.max() / scales.min())
+    reason = (
+        f"the widths of its channels differ by a factor of {ratio:.2g}, too far apart to share "
+        f"{count} variances"
+        if ratio > _APART
+        else f"{counted(count, 'Gaussian')} cannot follow its profile"
+    )
+    note(f"{name}: {reason} (error {error:.2g}); give a larger --count, or --error {_LARGE}")
