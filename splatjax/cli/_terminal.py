@@ -8,6 +8,7 @@ Multi-line explanations are in `help`, because the help keeps line breaks of doc
 import contextlib
 import functools
 import os
+import re
 import time
 from collections.abc import Callable, Container, Generator, Mapping, Sequence
 from dataclasses import MISSING, fields
@@ -155,7 +156,7 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
 
 
 # Environment variables of launchers with the number of processes; the first that is set is used.
-_LONGEST = 80  # characters of a setting that an error repeats
+_DIGEST = re.compile(r"\b([0-9a-f]{8})[0-9a-f]{24,}\b")  # shortened in errors
 _COUNTS = "JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"
 
 
@@ -224,14 +225,16 @@ def _check_record(path: Path, record: Mapping[str, Any], items: Sequence[tuple[P
         raise ValueError(f"{files[0]}: has no record of its settings; {remedy}")
     before = sj.io.read_record(path) if path.exists() else record
     changes = [
-        f"{name} is {record.get(name)}, but was {before.get(name)}"
-        if len(str(record.get(name))) < _LONGEST
-        else f"{name} changed"
+        f"{name} is {_shown(record.get(name))}, but was {_shown(before.get(name))}"
         for name in sorted(before.keys() | record.keys())
         if before.get(name) != record.get(name)
     ]
     if changes:
         raise ValueError(f"{path}: the settings changed: {'; '.join(changes)}; {remedy}")
+
+
+def _shown(value: Any) -> str:
+    return _DIGEST.sub(r"\1", str(value))
 
 
 def process_index_and_count() -> tuple[int, int]:

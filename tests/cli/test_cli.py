@@ -175,7 +175,7 @@ def test_the_number_of_splats_that_would_resolve_a_layer_is_noted(capsys):
     def fraction(count):
         scene = sj.Scene(bodies.sphere(count, 20.0, jitter=1.0), light, material)
         frame = sj.render(scene, camera, bodies.PLAIN)
-        note_unresolved(frame, scene, bodies.PLAIN.kernel, count)
+        note_unresolved(frame, scene, bodies.PLAIN.kernel, "--count", count)
         return float(frame.unresolved_fraction[0])
 
     assert fraction(800) > 0.9

@@ -99,6 +99,14 @@ def test_it_takes_the_model_that_is_asked_for(words, description, rtol, fits_end
     np.testing.assert_allclose(total, SKIN, rtol=rtol)
 
 
+def test_colors_that_gaussians_cannot_follow_are_named(fits_end_as, tmp_path, capsys):
+    fits_end_as(optx.RESULTS.successful)
+    skin, output = tmp_path / "dark.toml", tmp_path / "fitted.toml"
+    skin.write_text("[skin]\nmelanin = 0.2\n")
+    assert run("fit", skin, "--count", 1, "--output", output) == 0
+    assert "its green and blue are negative from" in capsys.readouterr().err
+
+
 def test_it_takes_normalized_diffusion_of_others(fits_end_as, tmp_path, capsys):
     fits_end_as(optx.RESULTS.successful)
     other, output = tmp_path / "other.toml", tmp_path / "fitted.toml"
