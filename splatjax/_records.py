@@ -118,7 +118,15 @@ def record(cls: Class) -> Class:
     fields = [part.replace(annotation=part.empty) for part in signature.parameters.values()]
     __init__.__signature__ = inspect.Signature([receiver, *fields])  # ty: ignore[missing-attribute]
     cls.__init__ = __init__  # ty: ignore[invalid-assignment]
+    cls.__repr__ = _with_numbers  # ty: ignore[invalid-assignment]
     return cls
+
+
+def _with_numbers(self: eqx.Module) -> str:
+    """Show the numbers of a small record, and the shapes of a large one."""
+    leaves = [leaf for leaf in jax.tree.leaves(self) if eqx.is_array(leaf)]
+    is_small = sum(leaf.size for leaf in leaves) <= _MOST_SHOWN and not is_traced(leaves)
+    return eqx.tree_pformat(self, short_arrays=not is_small)
 
 
 def require(holds: Any, message: str) -> None:
@@ -214,6 +222,7 @@ def check_ascending(name: str, values: Any) -> None:
     check_values(f"the steps of {name}", steps, requirement, lambda x: x > 0)
 
 
+_MOST_SHOWN = 60  # numbers
 _RECORDS = (eqx.Module, NoneType)
 
 

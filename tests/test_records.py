@@ -356,3 +356,21 @@ def test_a_view_along_up_needs_another_up(straight):
 @pytest.mark.parametrize("size", [1e-10, 1e12])
 def test_any_distance_that_single_precision_can_square_is_a_view(size):
     assert np.all(np.isfinite(sj.Camera.look_at(size * EYE, [0, 0, 0]).rotation))
+
+
+def test_small_records_show_their_numbers_and_large_ones_their_shapes():
+    assert "0.006" in repr(medium())
+    assert "centers=f" in repr(sj.bust(50))
+    jax.jit(lambda m: repr(m) and m.eta)(medium())
+
+
+@pytest.mark.parametrize("size", [np.int64(48), np.int32(48), 48])
+def test_a_picture_may_be_as_large_as_a_number_of_numpy(size):
+    assert type(sj.Camera(EYE, np.eye(3), 1.0, size, size).width) is int
+    with pytest.raises(ValueError, match=r"Camera.width must be .* an int"):
+        sj.Camera(EYE, np.eye(3), 1.0, 48.5, 48)
+
+
+def test_a_camera_has_right_handed_axes():
+    with pytest.raises(ValueError, match="right-handed"):
+        sj.Camera(EYE, -np.eye(3), 1.0, 8, 8)

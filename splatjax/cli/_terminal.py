@@ -131,6 +131,7 @@ def preview(draw: Callable[[int], list]) -> contextlib.AbstractContextManager[No
 
 
 def _show(draw: Callable[[int], list]) -> None:
+    note("compiling; later runs reuse the programs")
     if (
         CONSOLE.quiet
         or CONSOLE.no_color
@@ -139,7 +140,7 @@ def _show(draw: Callable[[int], list]) -> None:
         or not CONSOLE.file.isatty()
     ):
         return
-    note("a preview without scattering, shadows and gloss, while the picture is being compiled:")
+    note("a preview without scattering, shadows and gloss, meanwhile:")
     side = min(64, CONSOLE.width, 2 * CONSOLE.height - 8)  # one character shows two pixels
     with contextlib.suppress(Exception):  # a preview must never end the picture
         colors = [[f"rgb({red},{green},{blue})" for red, green, blue in row] for row in draw(side)]

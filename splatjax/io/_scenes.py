@@ -16,7 +16,7 @@ from splatjax.render import RenderSettings
 from splatjax.scene import Camera, EnvironmentLight, Material, Scene, Splats
 
 from ._cameras import load_camera, resized
-from ._files import StrPath, expect, naming, plain_record, record_names
+from ._files import StrPath, existing_file, expect, naming, plain_record, record_names
 from ._images import MANIFEST, read_planes
 from ._lights import LIGHT_ENTRIES, PLACE, light_of, look_at, plain_light, write_image
 from ._materials import MATERIAL_TABLES, load_material, plain_material
@@ -240,7 +240,7 @@ def _body(table: Table) -> tuple[Path, dict[str, Any]]:
     """Return the file of a body, its unit and upward axis, and the maps of a mesh."""
     is_mesh = "mesh" in table.entries
     unit = table.number("mm_per_unit", None if is_mesh else 1.0)
-    path = table.folder / table.text("mesh" if is_mesh else "file")
+    path = table.make(existing_file, table.folder / table.text("mesh" if is_mesh else "file"))
     v_up = {"v_up": table.one_of("v_up", (True, False))} if "v_up" in table.entries else {}
     maps: dict[str, Any] = v_up | {
         name: table.folder / table.text(name)
