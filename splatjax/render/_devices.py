@@ -173,8 +173,9 @@ _PLACES = "direction", "directions", "position", "center"
 
 
 def places_of(lights: Sequence[AbstractLight]) -> tuple[dict[str, Array], ...]:
-    """Return the directions and positions of lights, which determine their shadow maps."""
-    fields = [{name: getattr(light, name, None) for name in _PLACES} for light in lights]
+    """Return the directions and positions of the lights that cast shadows."""
+    casting = [light for light in lights if getattr(light, "cast_shadows", True)]
+    fields = [{name: getattr(light, name, None) for name in _PLACES} for light in casting]
     return tuple({k: v for k, v in places.items() if v is not None} for places in fields)
 
 

@@ -48,8 +48,8 @@ class PictureJacobian(eqx.Module):
         """
         variances, weights = (as_floats(each, self.weights.dtype) for each in (variances, weights))
         gaussians, _, _, channels = self.weights.shape
-        check_shape("variances", variances, (gaussians,), "as many as the picture has Gaussians")
-        check_shape("weights", weights, (gaussians, channels), "those of the picture's Gaussians")
+        check_shape("variances", variances, (gaussians,), "give one for each Gaussian")
+        check_shape("weights", weights, (gaussians, channels), "give a row for each Gaussian")
         return jnp.einsum("k,khwc->hwc", variances, self.variances) + jnp.einsum(
             "kc,khwc->hwc", weights, self.weights
         )

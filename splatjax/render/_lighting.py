@@ -102,7 +102,7 @@ class Transfer(eqx.Module):
     - `visibility`: for each kind of lights the visibility of each sample, along the splats in the
       order of the plan; `None` for lights that cast no shadows.
     - `needed`: needed capacity divided by planned capacity.
-    - `places`: the directions and positions of the lights.
+    - `places`: the directions and positions of the lights that cast shadows.
     """
 
     visibility: list[Float[Array, "_samples splats"] | None]

@@ -217,6 +217,21 @@ MISPLACED = [
 ]
 
 
+@pytest.mark.once
+def test_a_light_without_shadows_may_move_beside_kept_visibility():
+    def under(*fill):
+        lights = [lamp(0, 0, -1), lamp(*fill, cast_shadows=False)]
+        return sj.Scene(SCENE.splats, lights, SCENE.material)
+
+    before, moved = under(0.5, 0, -1), under(-0.5, 0.2, -1)
+    plan = sj.make_plan(before, CAMERA, SETTINGS)
+    kept = sj.transfer(before, plan, SETTINGS)
+    again, anew = (
+        sj.render(moved, CAMERA, SETTINGS, plan, light=light).beauty for light in (kept, None)
+    )
+    np.testing.assert_allclose(again, anew, atol=1e-6)
+
+
 @pytest.mark.parametrize(("call", "message"), MISPLACED)
 def test_misplaced_arguments_are_refused_by_name(call, message, float64):
     assert_refused(call, message)
