@@ -55,19 +55,22 @@ figure  # noqa: B018
 # ## The environment of a photograph
 #
 # Two photographs are rendered with noise of 1%: one under a soft studio of nine harmonics, and one
-# under the full studio, which has many more.
+# under the full studio, which has many more. The plan and shadow maps above are for harmonics; the
+# full studio has its own.
 
 # %%
 whole = sj.EnvironmentLight(sj.scene.studio(), 60, directions=even_directions(64))
 soft = HarmonicLight.of(whole, 2)
 
 
-def rendered(light):
-    scene = sj.Scene(splats, light, material)
-    return np.asarray(sj.render(scene, camera, plan=plan, light=kept).beauty)
+def rendered(scene, **parts):
+    return np.asarray(sj.render(scene, camera, **parts).beauty)
 
 
-clean = {"soft": rendered(soft), "whole": rendered(whole)}
+clean = {
+    "soft": rendered(sj.Scene(splats, soft, material), plan=plan, light=kept),
+    "whole": rendered(sj.Scene(splats, whole, material)),
+}
 noise = 0.01 * np.sqrt(np.mean(clean["soft"] ** 2))
 noisy = {
     name: picture + noise * np.random.default_rng(0).normal(size=picture.shape)
