@@ -70,6 +70,8 @@ GROUPS = {
 _LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")
 _NOTEBOOK = re.compile(r"^(notebooks/.*)\.py$")
 _MATHS = re.compile(r"\$([^$]+)\$")
+# Up to the first period or empty line outside of code.
+_FIRST_SENTENCE = re.compile(r"(?:`[^`]*`|(?!\n\n|(?<!Eq)(?<!\.)\.(?:\s|$)).)*", re.DOTALL)
 _NAME = re.compile(r"(?<!\[)`(splatjax(?:\.\w+)+)`(?!\])")
 
 
@@ -185,7 +187,7 @@ def _table(values: dict[str, Any], home: str = "") -> str:
     """Return a table of names, each with the first sentence of its documentation."""
     rows = ["| | |", "| --- | --- |"]
     for name, value in values.items():
-        sentence = re.split(r"(?<!Eq)(?<!\.)\.(?:\s|$)|\n\n", inspect.getdoc(value) or "")[0]
+        sentence = _FIRST_SENTENCE.match(inspect.getdoc(value) or "")[0]
         package = home or ".".join(getattr(value, "__module__", "").split(".")[:2])
         link = f"({name}.md)" if inspect.ismodule(value) else f"[{package}.{name}]"
         rows.append(f"| [`{name}`]{link} | {' '.join(sentence.split())} |")
@@ -206,16 +208,24 @@ def _public(module: str) -> dict[str, Any]:
 
 
 class Constructors(griffe.Extension):
-    """Adds the constructors of records, which equinox makes of their fields."""
+    """Adds the constructors of records, which equinox makes of their fields, and shows the values
+    of defaults and types that a method inherits.
+    """
 
     def on_class(self, *, cls: griffe.Class, **_: Any) -> None:
         record = pkgutil.resolve_name(cls.path)
         if "__init__" in cls.members or not dataclasses.is_dataclass(record):
             return
+        factories = {
+            field.name: field.default_factory
+            for field in dataclasses.fields(record)
+            if field.default_factory is not dataclasses.MISSING
+        }
         parameters = [griffe.Parameter("self")]
         for name, given in inspect.signature(record).parameters.items():
             field = next(each.members[name] for each in [cls, *cls.mro()] if name in each.members)
-            value = repr(given.default) if "field(" in str(field.value) else field.value
+            default = factories[name]() if name in factories else given.default
+            value = _text(default) if "field(" in str(field.value) else field.value
             parameters.append(
                 griffe.Parameter(
                     name,
@@ -226,6 +236,46 @@ class Constructors(griffe.Extension):
             )
         made = griffe.Parameters(*parameters)
         cls.set_member("__init__", griffe.Function("__init__", parameters=made, parent=cls))
+
+    def on_function(self, *, func: griffe.Function, **_: Any) -> None:
+        for parameter in func.parameters:
+            if re.fullmatch(r"_\w+", str(parameter.default)):  # a private constant of the module
+                constant = f"{func.module.path}.{parameter.default}"
+                parameter.default = _text(pkgutil.resolve_name(constant))
+        if not isinstance(func.parent, griffe.Class):
+            return
+        for base in func.parent.mro():
+            method = base.members.get(func.name)
+            if not isinstance(method, griffe.Function):
+                continue
+            for parameter in func.parameters:
+                if parameter.annotation is None and parameter.name in method.parameters:
+                    parameter.annotation = method.parameters[parameter.name].annotation
+            func.returns = func.returns or method.returns
+
+
+def _text(value: Any) -> str:
+    """Write a default as a user would: functions and classes by their names, long tuples shortened,
+    records without their own defaults.
+    """
+    if callable(value) and hasattr(value, "__name__"):
+        return value.__name__
+    if isinstance(value, tuple) and len(value) > 8:
+        return f"({value[0]!r}, {value[1]!r}, ..., {value[-1]!r})"
+    if isinstance(value, float):
+        return f"{value:.6g}" if value % 1 else repr(float(value))
+    if dataclasses.is_dataclass(value):
+        fields = ((field, getattr(value, field.name)) for field in dataclasses.fields(value))
+        given = ", ".join(
+            f"{field.name}={_text(held)}" for field, held in fields if not _is_default(field, held)
+        )
+        return f"{type(value).__name__}({given})"
+    return repr(value)
+
+
+def _is_default(field: dataclasses.Field, value: Any) -> bool:
+    """Whether a field of a record has its default."""
+    return repr(value) == repr(field.default)
 
 
 if __name__ == "__main__":

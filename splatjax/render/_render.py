@@ -45,7 +45,7 @@ def render(
     - `scene`: splats (mm), lights and material. Differentiable; the choice of visible splats is
       not.
     - `camera`: position and size of the picture. Differentiable.
-    - `settings`: settings of the passes.
+    - `settings`: settings of the passes, those of the plan.
     - `plan`: a plan from `splatjax.make_plan`, for this scene or a similar one. Required under
       `jit`, `grad` and `vmap`; otherwise made for each call.
     - `mesh`: devices over which the splats and their gradients are divided, of any axes
@@ -56,11 +56,12 @@ def render(
       Differentiable.
 
     **Returns:** a `Frame` in the dtype of `splats.centers`. With a mesh, every device has the whole
-    frame, equal to that without a mesh up to rounding.
+    frame, equal to that without a mesh up to rounding. If the plan does not suffice, the picture is
+    NaN and `overflow` is above 0.
 
-    **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another
-    number of splats, when `light` is for other kinds of lights, or when the scene's channels
-    disagree.
+    **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh, other
+    kinds of lights or another number of splats or Gaussians, when `light` is for other lights, or
+    when the scene's channels disagree.
     """
     plan = plan_unless_traced(scene, camera, settings, plan, mesh)
     scene, plan, light, own_rows = pad_scene(scene, plan, light, camera)

@@ -50,8 +50,8 @@ class Material(eqx.Module):
       for none.
     - `medium`: optical coefficients, which `ShapeDiffuser` uses instead of Gaussians, single
       scattering and angles; or `None`.
-    - `wavelengths`: the wavelength of each channel, nm, ascending; `None` for channels such as red,
-      green and blue. They only affect the colors of pictures (`io.picture_to_rgb`).
+    - `wavelengths`: the wavelength of each channel, 360 to 830 nm, ascending; `None` for channels
+      such as red, green and blue. They only affect the colors of pictures (`io.picture_to_rgb`).
 
     **Raises:** `ValueError` for a value out of range, for wavelengths that do not ascend, and if
     `single_scattering`, `angles` or `wavelengths` does not have the number of channels of the
@@ -103,7 +103,8 @@ class Material(eqx.Module):
 
         **Arguments:**
 
-        - `count`: number of Gaussians.
+        - `medium`: coefficients, 1/mm.
+        - `count`: number of Gaussians, or `LeastCount(error)` for the least that reaches an error.
         - `model`: the model of the profile, by default light transport with isotropic scattering;
           use `TransportModel(g=0.8)` for forward scattering.
         - `surface`: `specular`, `roughness` and `eta`; the default `eta` is that of the medium.

@@ -39,6 +39,8 @@ _PIXELS = valid("at least 1 (pixels), an int", lambda x: (x >= 1) & (x.dtype.kin
 class Camera(eqx.Module):
     r"""A pinhole camera; `Camera.look_at` places one by position and target.
 
+        camera = Camera.look_at((66, 4, 140), (0, -9, 0), fov=30)  # mm, degrees
+
     Pixel centers are at half integers, and the origin of the picture is its top left corner. In
     camera coordinates x points right, y points down, and z points into the picture.
 
@@ -176,6 +178,12 @@ class Splats(eqx.Module):
     r"""The surface of a body as overlapping discs, one row per splat. Coordinates are in mm,
     right-handed, with +y up.
 
+        splats = bust(200_000)
+        splats = sample_mesh("head.glb", 200_000, mm_per_unit=1000)
+        splats = Splats([[0, 0, 0]], [[0, 0, 1]], radii=[1.5], areas=[1])
+
+    `splatjax.geometry.complete_splats` estimates normals, radii and areas of points.
+
     Splats that are near in space should be near in memory, as `read_splats` and `sample_mesh` sort
     them. The order affects the speed, not the picture.
 
@@ -223,6 +231,7 @@ class Splats(eqx.Module):
 
     @property
     def count(self) -> int:
+        """Number of splats."""
         return self.centers.shape[0]
 
     def scaled(self, factor: Float[Array, ""] | float) -> "Splats":
