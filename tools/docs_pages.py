@@ -72,6 +72,8 @@ _NOTEBOOK = re.compile(r"^(notebooks/.*)\.py$")
 _MATHS = re.compile(r"\$([^$]+)\$")
 # Up to the first period or empty line outside of code.
 _FIRST_SENTENCE = re.compile(r"(?:`[^`]*`|(?!\n\n|(?<!Eq)(?<!\.)\.(?:\s|$)).)*", re.DOTALL)
+_INLINE_CODE = re.compile(r"<code>[^<]*</code>")
+_OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 _NAME = re.compile(r"(?<!\[)`(splatjax(?:\.\w+)+)`(?!\])")
 
 
@@ -115,6 +117,15 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         for part in parts[::2]
     ]
     return "".join(parts)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Keep options of the command line in one line: browsers break after each hyphen."""
+
+    def whole(match: re.Match) -> str:
+        return _OPTION.sub(r'<span class="option">\g<0></span>', match[0])
+
+    return _INLINE_CODE.sub(whole, html)
 
 
 def _notebook_pages() -> Iterator[tuple[str, str | bytes]]:
