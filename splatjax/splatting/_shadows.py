@@ -45,12 +45,13 @@ class ShadowSettings(eqx.Module):
     - `pixels_per_spacing`: largest number of pixels of the map per spacing of the splats; a finer
       map would show single discs instead of the body. `inf` for the full resolution. The size is
       rounded up to one of two sizes per octave, and is at least 64.
-    - `bias`: a splat up to this distance behind the surface of the map is fully lit. The unit is
+    - `bias`: a splat that faces the light is compared with the map at this distance along its
+      normal. Without it a surface would shadow itself, most of all at grazing light. The unit is
       `sqrt(radius^2 + diagonal^2)`, with the radius of the splat, or of its merged disc, and the
       diagonal of a pixel of the map at its depth.
-    - `softness`: beyond `bias`, the light fades to 0 over this distance, in the same unit, so that
-      shadows have gradients with respect to depth. Across the edge of a shadow, light fades over
-      about two pixels of the map.
+    - `softness`: behind the surface of the map, the light fades to 0 over this distance, in the
+      same unit, so that shadows have gradients with respect to depth. Across the edge of a shadow,
+      light fades over about two pixels of the map.
     - `compared`: a splat is compared with 2 x 2 or 3 x 3 pixels of the map.
     - `merged_spacing`: largest spacing of merged discs, in pixels of the map; 0 merges no splats.
       Each disc replaces 8, 16 or 32 neighboring splats, the most for which it fits.
@@ -60,7 +61,7 @@ class ShadowSettings(eqx.Module):
     """
 
     resolution: int = eqx.field(static=True, default=1024, metadata=_RESOLUTIONS)
-    bias: float = eqx.field(static=True, default=0.2, metadata=_NOT_NEGATIVE)
+    bias: float = eqx.field(static=True, default=0.25, metadata=_NOT_NEGATIVE)
     softness: float = eqx.field(static=True, default=0.4, metadata=_POSITIVE)
     largest_slope: float = eqx.field(static=True, default=8.0, metadata=_POSITIVE)
     compared: int = eqx.field(static=True, default=3, metadata=_COMPARED)
@@ -266,8 +267,8 @@ def compute_visibility(
     r"""Compute the fraction of a light that reaches each splat, by soft comparison with its shadow
     map.
 
-    Nine pixels, or four, are compared and averaged with a spline; at each, the splat's depth is
-    continued along its own plane. The front surface blocks light with its coverage, and the one
+    Nine pixels, or four, are compared and averaged with a spline; at each, the depth of the splat,
+    moved along its normal by the bias, is continued along its own plane. The front surface blocks light with its coverage, and the one
     behind it with the remaining coverage.
 
     **Returns:** in [0, 1]; 1 outside the map. Differentiable in the splats, the view and the map.
@@ -277,9 +278,13 @@ def compute_visibility(
 
     def land(centers, normals, radii):
         x, y, depth = view.project(centers.T)
-        across, down, facing = view.depth_slope(x, y, depth, normals.T)
-        facing = jnp.maximum(facing, 1 / settings.largest_slope)
         reach = jnp.sqrt(shadow_map.splats_per_disc * radii**2 + 2 * view.pixel_size(depth) ** 2)
+        across, down, facing = view.depth_slope(x, y, depth, normals.T)
+        steep = 1 / settings.largest_slope
+        # Splats that face away from the light stay in the shadow of those that face it.
+        bias = settings.bias * reach * jnp.clip(1 + facing / steep, 0, 1)
+        x, y, depth = view.project(centers.T + bias[None] * normals.T)
+        facing = jnp.maximum(facing, steep)
         return x, y, depth, across / facing, down / facing, reach
 
     # The projected positions are stored: each comparison, and each derivative, reads them.
@@ -318,7 +323,7 @@ def _compared(
 
     def hidden(map_depth, map_coverage):
         beyond = (expected - map_depth) / reach[None, None]
-        return map_coverage * smooth_step(beyond - settings.bias, 0, settings.softness)
+        return map_coverage * smooth_step(beyond, 0, settings.softness)
 
     front_depth, front_coverage, behind_depth, behind_coverage = (
         plane.at[index].get(mode="promise_in_bounds") for plane in flat

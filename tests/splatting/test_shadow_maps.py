@@ -180,7 +180,7 @@ def test_a_map_no_finer_than_its_splats_shows_the_whole_shadow(scale):
     body, blocked = body.scaled(scale), {}
     for settings in (ShadowSettings(), ShadowSettings(pixels_per_spacing=np.inf)):
         settings = settings.for_spacing(scale, bounds_of(body))
-        view = distant_view(jnp.asarray([0.3, 0.1, -1.0]), bounds_of(body), settings)
+        view = distant_view(jnp.asarray([0.28, 0.05, -1.0]), bounds_of(body), settings)
         visible = visibility(body, view, plan_for(view, body), settings)[:floor]
         shadow = np.sum((1 - np.asarray(visible, float)) * np.asarray(body.areas[:floor], float))
         blocked[int(settings.side)] = shadow / scale**2
@@ -193,9 +193,7 @@ def test_a_map_no_finer_than_its_splats_shows_the_whole_shadow(scale):
 @pytest.mark.once
 @pytest.mark.parametrize("kind", [*LIGHTS, "cube"])
 def test_a_sphere_does_not_shadow_itself(kind):
-    """Every splat whose cosine to the light is above 0.2 is lit; the discs' own curvature is a
-    quarter of the bias.
-    """
+    """Every splat whose cosine to the light is above 0.02 is lit."""
     body, toward = bodies.sphere(1500, 10.0), jnp.asarray([0.6, 0.3, 0.742])
     if kind == "cube":  # a point amid splats that face it
         body, toward = (
@@ -216,7 +214,7 @@ def test_a_sphere_does_not_shadow_itself(kind):
     )
     wi = bodies.unit(np.asarray(toward) - (0 if kind == "distant" else np.asarray(body.centers)))
     cosine = np.sum(wi * np.asarray(body.normals, float), axis=1)
-    assert np.min(visible[cosine > 0.2]) > 0.99
+    assert np.min(visible[cosine > 0.02]) > 0.99  # 0.2 is needed with a bias along the light
     assert kind == "cube" or np.max(visible[cosine < -0.3]) < 0.01
 
 
