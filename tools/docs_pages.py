@@ -266,8 +266,8 @@ class Constructors(griffe.Extension):
 
 
 def _text(value: Any) -> str:
-    """Write a default as a user would: functions and classes by their names, long tuples shortened,
-    records without their own defaults.
+    """Write a default as a user would: functions and classes by their names, long tuples
+    shortened.
     """
     if callable(value) and hasattr(value, "__name__"):
         return value.__name__
@@ -275,18 +275,7 @@ def _text(value: Any) -> str:
         return f"({value[0]!r}, {value[1]!r}, ..., {value[-1]!r})"
     if isinstance(value, float):
         return f"{value:.6g}" if value % 1 else repr(float(value))
-    if dataclasses.is_dataclass(value):
-        fields = ((field, getattr(value, field.name)) for field in dataclasses.fields(value))
-        given = ", ".join(
-            f"{field.name}={_text(held)}" for field, held in fields if not _is_default(field, held)
-        )
-        return f"{type(value).__name__}({given})"
     return repr(value)
-
-
-def _is_default(field: dataclasses.Field, value: Any) -> bool:
-    """Whether a field of a record has its default."""
-    return repr(value) == repr(field.default)
 
 
 if __name__ == "__main__":

@@ -37,9 +37,7 @@ _PIXELS = valid("at least 1 (pixels), an int", lambda x: (x >= 1) & (x.dtype.kin
 
 @record
 class Camera(eqx.Module):
-    r"""A pinhole camera; `Camera.look_at` places one by position and target.
-
-        camera = Camera.look_at((66, 4, 140), (0, -9, 0), fov=30)  # mm, degrees
+    r"""A pinhole camera, for instance `Camera.look_at((66, 4, 140), (0, -9, 0), fov=30)`.
 
     Pixel centers are at half integers, and the origin of the picture is its top left corner. In
     camera coordinates x points right, y points down, and z points into the picture.
@@ -52,8 +50,7 @@ class Camera(eqx.Module):
     - `focal_length`: focal length divided by the height of the picture: `1 / (2 tan(fov / 2))` for
       a vertical field of view `fov`. Differentiable.
     - `width`, `height`: size of the picture, pixels. Static.
-    - `near`: least distance of splat centers along the forward axis, mm; nearer splats are not
-      rendered. Static.
+    - `near`: least depth of the centers of splats that are rendered, mm. Static.
     - `principal_point`: where the forward axis meets the picture: column divided by `width` and row
       divided by `height`. `None` is the middle, `[0.5, 0.5]`. Differentiable.
 
@@ -107,8 +104,7 @@ class Camera(eqx.Module):
         **Arguments:**
 
         - `eye`, `target`: mm. `target` appears in the middle of the picture.
-        - `up`: the direction that points up in the picture, of any length, not along the line of
-          sight.
+        - `up`: points up in the picture, of any length, not along the line of sight.
         - `fov`: vertical field of view, degrees, between 0 and 180.
         - `width`, `height`: size of the picture, pixels.
         - `near`: splats nearer than this (mm) are not rendered.
@@ -176,13 +172,9 @@ _NOT_NEGATIVE = valid("finite and at least 0", lambda x: x >= 0)
 @record
 class Splats(eqx.Module):
     r"""The surface of a body as overlapping discs, one row per splat. Coordinates are in mm,
-    right-handed, with +y up.
+    right-handed, with +y up. `bust`, `sample_mesh` and `read_splats` make them, or the constructor:
 
-        splats = bust(200_000)
-        splats = sample_mesh("head.glb", 200_000, mm_per_unit=1000)
         splats = Splats([[0, 0, 0]], [[0, 0, 1]], radii=[1.5], areas=[1])
-
-    `splatjax.geometry.complete_splats` estimates normals, radii and areas of points.
 
     Splats that are near in space should be near in memory, as `read_splats` and `sample_mesh` sort
     them. The order affects the speed, not the picture.
@@ -190,7 +182,7 @@ class Splats(eqx.Module):
     **Attributes:** (all differentiable unless stated otherwise)
 
     - `centers`: mm. Coverage and shading are smooth functions of the centers; visibility is
-      discontinuous.
+      discontinuous. `splatjax.geometry.complete_splats` estimates the rest for bare points.
     - `normals`: outward unit vectors.
     - `radii`: mm, positive; about 1.5 times the square root of the area, so that the overlapping
       discs leave no holes.
@@ -198,8 +190,7 @@ class Splats(eqx.Module):
       surface; they are not `pi r^2`, because the discs overlap.
     - `albedo`: diffuse color, linear, in [0, 1], which multiplies the color of the material; `None`
       for 1.
-    - `specular`: factor of the material's specular strength; `None` for 1.
-    - `roughness`: factor of the material's roughness; `None` for 1.
+    - `specular`, `roughness`: factors of those of the material; `None` for 1.
     - `weights`: factor of the material's weights for each Gaussian and channel, which varies the
       material over the body (freckles, lips, veins); `None` for 1.
 

@@ -25,7 +25,7 @@ from ._views import CLOSED, AbstractView, SplattingSettings
 # in pictures makes its shadow extend less. Evenly spread splats always exceed a sum of 1.
 _COVERED = 2 * CLOSED
 _LEAST_RESOLUTION = 64
-_RESOLUTIONS = valid("at least 8 (pixels)", lambda n: n >= 8)
+_AT_LEAST_8 = valid("at least 8 (pixels)", lambda n: n >= 8)
 _COMPARED = valid("2 or 3 (pixels)", lambda n: (n == 2) | (n == 3))
 _NOT_NEGATIVE = valid("at least 0", lambda x: x >= 0)
 _POSITIVE = valid("positive", lambda x: x > 0)
@@ -36,8 +36,8 @@ _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 class ShadowSettings(eqx.Module):
     r"""Settings of shadow maps and of the comparison with them. All are static except `filled`.
 
-    For sharper edges, raise `resolution` and `pixels_per_spacing`. For shadows closer to a contact,
-    lower `bias` and `softness`. If a surface shadows itself, raise `bias`.
+    For sharper edges, raise `resolution` and `pixels_per_spacing`; for shadows closer to a contact,
+    lower `bias` and `softness`; if a surface shadows itself, raise `bias`.
 
     **Attributes:**
 
@@ -46,22 +46,20 @@ class ShadowSettings(eqx.Module):
       map would show single discs instead of the body. `inf` for the full resolution. The size is
       rounded up to one of two sizes per octave, and is at least 64.
     - `bias`: a splat that faces the light is compared with the map at this distance along its
-      normal. Without it a surface would shadow itself, most of all at grazing light. The unit is
-      `sqrt(radius^2 + diagonal^2)`, with the radius of the splat, or of its merged disc, and the
-      diagonal of a pixel of the map at its depth.
+      normal, so that no surface shadows itself. The unit is `sqrt(radius^2 + diagonal^2)`, with the
+      radius of the splat, or merged disc, and the diagonal of a pixel of the map at its depth.
     - `softness`: behind the surface of the map, the light fades to 0 over this distance, in the
-      same unit, so that shadows have gradients with respect to depth. Across the edge of a shadow,
-      light fades over about two pixels of the map.
+      same unit, so that shadows have gradients. Across their edges it fades over about two pixels.
     - `compared`: a splat is compared with 2 x 2 or 3 x 3 pixels of the map.
-    - `merged_spacing`: largest spacing of merged discs, in pixels of the map; 0 merges no splats.
-      Each disc replaces 8, 16 or 32 neighboring splats, the most for which it fits.
+    - `merged_spacing`: largest spacing of discs that replace 8, 16 or 32 neighboring splats each,
+      in pixels of the map; 0 merges no splats.
     - `largest_slope`: the slope up to which the receiver's plane is continued from pixel to pixel
       of the map. On heads, 4 leaves steps at grazing light, and more than 8 has no effect.
     - `filled`: side, in pixels, of the part of the map that shows the body. `None` to derive it.
     """
 
-    resolution: int = eqx.field(static=True, default=1024, metadata=_RESOLUTIONS)
-    bias: float = eqx.field(static=True, default=0.25, metadata=_NOT_NEGATIVE)
+    resolution: int = eqx.field(static=True, default=1024, metadata=_AT_LEAST_8)
+    bias: float = eqx.field(static=True, default=0.2, metadata=_NOT_NEGATIVE)
     softness: float = eqx.field(static=True, default=0.4, metadata=_POSITIVE)
     largest_slope: float = eqx.field(static=True, default=8.0, metadata=_POSITIVE)
     compared: int = eqx.field(static=True, default=3, metadata=_COMPARED)
@@ -264,27 +262,24 @@ def _spline(away: Float[Array, "pixels ..."]) -> Float[Array, "pixels ..."]:
 def compute_visibility(
     splats: Splats, shadow_map: ShadowMap, settings: ShadowSettings
 ) -> Float[Array, " splats"]:
-    r"""Compute the fraction of a light that reaches each splat, by soft comparison with its shadow
-    map.
+    r"""Compute the fraction of a light that reaches each splat, by comparison with its shadow map.
 
-    Nine pixels, or four, are compared and averaged with a spline; at each, the depth of the splat,
-    moved along its normal by the bias, is continued along its own plane. The front surface blocks light with its coverage, and the one
+    Nine pixels, or four, are compared and averaged with a spline; at each, the splat's depth is
+    continued along its own plane. The front surface blocks light with its coverage, and the one
     behind it with the remaining coverage.
 
     **Returns:** in [0, 1]; 1 outside the map. Differentiable in the splats, the view and the map.
     """
-    view = shadow_map.view
-    flat = shadow_map.planes.reshape(4, -1)
+    view, flat = shadow_map.view, shadow_map.planes.reshape(4, -1)
 
     def land(centers, normals, radii):
         x, y, depth = view.project(centers.T)
         reach = jnp.sqrt(shadow_map.splats_per_disc * radii**2 + 2 * view.pixel_size(depth) ** 2)
         across, down, facing = view.depth_slope(x, y, depth, normals.T)
-        steep = 1 / settings.largest_slope
         # Splats that face away from the light stay in the shadow of those that face it.
-        bias = settings.bias * reach * jnp.clip(1 + facing / steep, 0, 1)
+        bias = settings.bias * reach * jnp.clip(1 + settings.largest_slope * facing, 0, 1)
         x, y, depth = view.project(centers.T + bias[None] * normals.T)
-        facing = jnp.maximum(facing, steep)
+        facing = jnp.maximum(facing, 1 / settings.largest_slope)
         return x, y, depth, across / facing, down / facing, reach
 
     # The projected positions are stored: each comparison, and each derivative, reads them.
