@@ -1,10 +1,11 @@
 """The five passes: plan the sizes of their arrays, then render.
 
-The formulas of the passes are in splatting, diffusion and shading. Read `Passes` in `_passes.py`
-first: every picture is one call of `Passes.picture`. Its arguments are the function that lights the
-splats (`light_at`) and the function that reads the shaded points (`read`). `_render.py` has the
-simplest pictures, and `_devices.py` the distribution over devices.
+The formulas of the passes are in splatting, diffusion and shading.
 """
+
+# Read `Passes` in `_passes.py` first: every picture is one call of `Passes.picture`. Its arguments
+# are the function that lights the splats (`light_at`) and the function that reads the shaded points
+# (`read`). `_render.py` has the simplest pictures, and `_devices.py` the distribution over devices.
 
 from ._basis import (
     diffusion_basis as diffusion_basis,

@@ -38,7 +38,8 @@ def render(
 
         plan = make_plan(scene, camera)
         frame = render(scene, camera, plan=plan)
-        gradient = eqx.filter_grad(lambda s: render(s, camera, plan=plan).beauty.mean())(scene)
+        mean = lambda scene: render(scene, camera, plan=plan).beauty.mean()
+        gradient = eqx.filter_grad(mean)(scene)
 
     **Arguments:**
 

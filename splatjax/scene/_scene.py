@@ -37,7 +37,7 @@ _PIXELS = valid("at least 1 (pixels), an int", lambda x: (x >= 1) & (x.dtype.kin
 
 @record
 class Camera(eqx.Module):
-    r"""A pinhole camera, for instance `Camera.look_at((66, 4, 140), (0, -9, 0), fov=30)`.
+    r"""A pinhole camera; `Camera.look_at` places one by position and target.
 
     Pixel centers are at half integers, and the origin of the picture is its top left corner. In
     camera coordinates x points right, y points down, and z points into the picture.
