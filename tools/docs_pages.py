@@ -250,9 +250,9 @@ class Constructors(griffe.Extension):
 
     def on_function(self, *, func: griffe.Function, **_: Any) -> None:
         for parameter in func.parameters:
-            if re.fullmatch(r"_\w+", str(parameter.default)):  # a private constant of the module
-                constant = f"{func.module.path}.{parameter.default}"
-                parameter.default = _text(pkgutil.resolve_name(constant))
+            name = str(parameter.default)
+            if name[0] == "_" and name.isidentifier():  # a private constant of the module
+                parameter.default = _text(pkgutil.resolve_name(f"{func.module.path}.{name}"))
         if not isinstance(func.parent, griffe.Class):
             return
         for base in func.parent.mro():
